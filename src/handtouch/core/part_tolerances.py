@@ -1,11 +1,12 @@
 """Tolerances of a pad's parts as a deployment states them, for the stages.
 
-Public names: `stage_tolerances`.
+Public names: `stage_tolerances`, `overhangs`, `OVERHANG_STEP`.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from handtouch.hand.pads import log_aspect_std, metres_per_unit, pad_surface, re
 
 FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
+OVERHANG_STEP = 1 / 16
+_OVERHANGS, _DIRECTIONS, _SEGMENT_POINTS = 33, 8, 24
 
 
 def stage_tolerances(
@@ -38,6 +41,7 @@ def stage_tolerances(
     has_series = any(pad.series_ohm)
     elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
     is_elongated = bool(elongations.any())
+    radius_m = math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm) * _M_PER_MM
     return PadTolerances(
         view_memory(table.tolerance_nodes),
         len(table.tolerance_nodes) - 1,
@@ -53,9 +57,39 @@ def stage_tolerances(
         size_x,
         size_y,
         view_memory(elongations),
+        view_memory(radius_m * overhangs(sheet.contact_elongation_std)),
+        radius_m * OVERHANG_STEP,
         is_elongated,
         not (end_vectors.any() or aspect_std or sheet.unevenness_std or has_series or is_elongated),
     )
+
+
+@cache
+def overhangs(elongation_std: float) -> FloatArray:
+    """Return the root mean square shift (k,) of positions found at multiples of `OVERHANG_STEP` from an edge.
+
+    In contact radii. elongation_std: of the logarithm of length over width. The current of an elliptical
+    patch is that of the segment between its foci with the density (1 - t^2)^(1/2); what hangs over an edge
+    enters at the edge. So the centre of the current, which is the position found, is farther inside than the
+    patch's, which is equally likely anywhere on the pad, in any direction.
+    """
+    deviations = np.linspace(-3.5, 3.5, 36)
+    ratio = np.exp(elongation_std * np.abs(deviations))
+    directions = (np.arange(_DIRECTIONS) + 0.5) * np.pi / 2 / _DIRECTIONS
+    reach = np.outer(np.sqrt(ratio - 1 / ratio), np.cos(directions)).ravel()
+    angles = np.pi * np.arange(1, _SEGMENT_POINTS + 1) / (_SEGMENT_POINTS + 1)
+    points, share = np.cos(angles)[:, None], np.sin(angles) ** 2 / (np.sin(angles) ** 2).sum()
+    found_at = OVERHANG_STEP * np.arange(_OVERHANGS)
+    centre = np.linspace(0.0, found_at[-1], 8 * _OVERHANGS)
+    square, weight = np.zeros((2, _OVERHANGS))
+    for length, likely in zip(reach, np.repeat(np.exp(-0.5 * deviations**2), _DIRECTIONS), strict=True):
+        found = share @ np.maximum(centre + length * points, 0.0)
+        shift = np.interp(found_at, found, found - centre, left=0.0)
+        # no patch of this length is found nearer than one on the edge
+        density = np.interp(found_at, found, np.gradient(centre, found), left=0.0)
+        square += likely * density * shift**2
+        weight += likely * density
+    return np.asarray(np.sqrt(square / np.maximum(weight, 1e-300)))
 
 
 def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.simulate.sheet_solver import SheetMapBank
+from handtouch.simulate.sheet_solver import EDGE_INSET_FRACTION, SheetMapBank
 
 FloatArray = NDArray[np.float64]
 
@@ -106,6 +106,9 @@ def look_up_patches(
         points = position[:, None, long] + _NODES[:, None] * focus[:, None, long]
         shape = (_NODE_COUNT, len(long))
         found, by = bank.look_up(np.tile(sheet[long], _NODE_COUNT), *points.reshape(2, -1))
+        # maps end inside the edge, from where shares are nearly linear; what hangs over enters at the edge
+        beyond = np.clip(points, 0.0, 1.0) - np.clip(points, EDGE_INSET_FRACTION, 1 - EDGE_INSET_FRACTION)
+        found[:-1] += np.einsum("mak,ak->mk", by[:-1], beyond.reshape(2, -1))
         values[:-1, long] = np.einsum("n,mnk->mk", _WEIGHTS, found[:-1].reshape(-1, *shape))
         slopes[:-1, :, long] = np.einsum("n,mank->mak", _WEIGHTS, by[:-1].reshape(-1, 2, *shape))
     return values, slopes

@@ -4,7 +4,7 @@ from handtouch.core.stages cimport force, locate, tables, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
-cdef double _NAN, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
+cdef double _NAN, _VALID, _LOWER_BOUND, _BOUND_SIGMA, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
 cdef Py_ssize_t _PAIRED_CHANNELS
 
 cdef class ContactSolver:
@@ -30,11 +30,15 @@ cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, values='double[::1]')
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)
-cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad) noexcept
+cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) noexcept
+@cython.locals(row=Py_ssize_t, values='double[::1]', chance=double)
+cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(row=Py_ssize_t, fit=locate.Fit, at=tables.Placement, values='double[::1]')
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances)
 cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances, at=tables.Placement)
+cdef void _add_overhang(ContactSolver solver, Py_ssize_t pad) noexcept
 cdef void _write_row(
     double[::1] values, Py_ssize_t first, locate.Fit fit, tables.Placement at, double t, double w) noexcept
 @cython.locals(n=Py_ssize_t)

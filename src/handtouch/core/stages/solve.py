@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from handtouch.core.stages import force, locate, tables, tolerances
+from handtouch.field import contact_law
 
 _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
 _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT = 14, 23, 26, 27, 29, 30
@@ -29,6 +30,8 @@ VALUE_SLICES = {
 }
 """Layout of a row of values."""
 _NAN = float("nan")
+_VALID, _LOWER_BOUND = 0.0, 1.0  # force_status
+_BOUND_SIGMA = contact_law.BOUND_SIGMA
 MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
 n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
@@ -119,7 +122,9 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     tables.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
     _propagate(solver, pad)
     if solver.force_requested[pad]:
-        _estimate_force(solver, pad)
+        _estimate_force(solver, pad, 1.0)
+        if fit.cost > _MAX_SQUARED_MISFIT:
+            _span_two_patches(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS:
         _add_extent(table, fit, values[row + _RESIDUAL])
     _write_position(solver, pad)
@@ -210,7 +215,28 @@ def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
     values[row + _PAD_NOISE + 2] = yy * around * around
 
 
-def _estimate_force(solver: ContactSolver, pad: int) -> None:
+def _span_two_patches(solver: ContactSolver, pad: int) -> None:
+    """Let the force of a contact that is no point span that of two equal patches of the same total current.
+
+    They are the likelier the larger the misfit; as likely as one from twice its limit on.
+    """
+    values, row, chance = solver.values, pad * _COUNT, 0.5
+    chance *= min(solver.fit.cost / _MAX_SQUARED_MISFIT - 1.0, 1.0)
+    one, one_std, status = values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS]
+    _estimate_force(solver, pad, 0.5)
+    two, two_std = 2.0 * values[row + _FORCE], 2.0 * values[row + _FORCE_STD]
+    if status == _VALID and values[row + _FORCE_STATUS] == _VALID:
+        variance = (1.0 - chance) * one_std * one_std + chance * two_std * two_std
+        one_std = math.sqrt(variance + chance * (1.0 - chance) * (two - one) * (two - one))
+        one += chance * (two - one)
+    elif status == _LOWER_BOUND:
+        if values[row + _FORCE_STATUS] == _VALID:
+            two -= _BOUND_SIGMA * two_std
+        one += 2.0 * chance * (min(one, max(two, 0.0)) - one)
+    values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS] = one, one_std, status
+
+
+def _estimate_force(solver: ContactSolver, pad: int, share: float) -> None:
     fit, values, row = solver.fit, solver.values, pad * _COUNT
     n, law = fit.whitening.electrodes, solver.laws[pad]
     log_spreading_m = fit.raw[n] + math.log(solver.placement.scale_m)
@@ -218,7 +244,7 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
     slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
     variance = 0.0
     if fit.var_x < 1e300 and fit.var_y < 1e300:
-        whole = force.whole_factor(law, fit.total) / fit.total
+        whole = force.whole_factor(law, share * fit.total) / fit.total
         variance = slope_x * slope_x * fit.var_x + slope_y * slope_y * fit.var_y
         variance += 2.0 * slope_x * slope_y * fit.cov_xy
         variance += 2.0 * whole * (slope_x * fit.cov_x_total + slope_y * fit.cov_y_total)
@@ -226,12 +252,12 @@ def _estimate_force(solver: ContactSolver, pad: int) -> None:
         solver.stack,
         law,
         solver.result,
-        fit.total,
-        math.sqrt(fit.var_total),
+        share * fit.total,
+        share * math.sqrt(fit.var_total),
         log_spreading_m,
         (slope_x * slope_x + slope_y * slope_y) / (solver.placement.scale_m * solver.placement.scale_m),
         variance,
-        force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
+        force.series_resistance(law, solver.currents, pad * solver.electrodes, n) / share,
     )
     values[row + _FORCE], values[row + _FORCE_STD] = solver.result.force_n, solver.result.std_n
     values[row + _FORCE_STATUS] = 1.0 * solver.result.status
@@ -247,6 +273,7 @@ def _write_position(solver: ContactSolver, pad: int) -> None:
     values[row + _POSITION], values[row + _POSITION + 1], values[row + _POSITION + 2] = at.px, at.py, at.pz
     values[row + _NORMAL], values[row + _NORMAL + 1], values[row + _NORMAL + 2] = at.nx, at.ny, at.nz
     _add_size(solver, pad)
+    _add_overhang(solver, pad)
     _write_row(values, row + _COVARIANCE, fit, at, at.tx, at.wx)
     _write_row(values, row + _COVARIANCE + 3, fit, at, at.ty, at.wy)
     _write_row(values, row + _COVARIANCE + 6, fit, at, at.tz, at.wz)
@@ -260,6 +287,17 @@ def _add_size(solver: ContactSolver, pad: int) -> None:
     aside_y = (fit.y - 0.5 * table.side_y) * parts.size_y
     fit.var_x += aside_x * aside_x
     fit.var_y += aside_y * aside_y
+
+
+def _add_overhang(solver: ContactSolver, pad: int) -> None:
+    """Add the covariance of positions of elongated contacts that may hang over an edge."""
+    fit, table, parts, at = solver.fit, solver.models[pad], solver.pad_tolerances[pad], solver.placement
+    if not parts.is_elongated:
+        return
+    shift_x = tolerances.overhang(parts, min(fit.x, table.side_x - fit.x) * at.along_m) / at.along_m
+    shift_y = tolerances.overhang(parts, min(fit.y, table.side_y - fit.y) * at.around_m) / at.around_m
+    fit.var_x += shift_x * shift_x
+    fit.var_y += shift_y * shift_y
 
 
 def _write_row(

@@ -9,7 +9,8 @@ cdef class PadTolerances:
     cdef double[::1] end_vectors, series_vectors
     cdef Py_ssize_t cells
     cdef double cell_ratio, aspect_std, wave_std, series_std, sheet_std, middle_u_m, size_x, size_y
-    cdef double[::1] elongations
+    cdef double[::1] elongations, overhangs
+    cdef double overhang_step_m
     cdef bint has_series, is_elongated, is_shape_exact
 
 cdef class PartKnowledge:
@@ -48,6 +49,8 @@ cdef void _compute_changes(
     n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, cell=Py_ssize_t, vector='double[::1]', fields='double[::1]')
 cdef void _add_elongation(
     Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
+@cython.locals(k=Py_ssize_t)
+cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void _add_square(Whitening whitening) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)

@@ -26,7 +26,9 @@ class PadTolerances:
     changes by the logarithm of each resistor, per its electrode's fraction; series_std, sheet_std: of the
     logarithms of resistors and sheet resistance. middle_u_m: arc length from the electrode x0 to the pad's
     middle; size_x, size_y: relative standard deviations of its sides. elongations: (cells + 1,) along x,
-    standard deviation of what an elongated contact multiplies derivatives by x x and x y with.
+    standard deviation of what an elongated contact multiplies derivatives by x x and x y with. overhangs:
+    (k,) root mean square shift [m] of positions from an edge that an elongated contact hangs over, at
+    multiples of `overhang_step_m` from it.
     """
 
     def __init__(
@@ -45,6 +47,8 @@ class PadTolerances:
         size_x: float,
         size_y: float,
         elongations: memoryview[float],
+        overhangs: memoryview[float],
+        overhang_step_m: float,
         is_elongated: bool,
         is_shape_exact: bool,
     ) -> None:
@@ -57,6 +61,7 @@ class PadTolerances:
         self.series_std, self.sheet_std, self.has_series = series_std, sheet_std, has_series
         self.middle_u_m, self.size_x, self.size_y = middle_u_m, size_x, size_y
         self.elongations, self.is_elongated = elongations, is_elongated
+        self.overhangs, self.overhang_step_m = overhangs, overhang_step_m
         self.is_shape_exact = is_shape_exact  # none but gains have a tolerance
 
 
@@ -247,6 +252,15 @@ def _add_elongation(
         for i in range(n):
             vector[i] = std * fields[(3 + _WAVES + k) * n + i] * total * weight[i]
         _add_square(whitening)
+
+
+def overhang(pad: PadTolerances, distance_m: float) -> float:
+    """Return the root mean square shift [m] of a position by the part of a contact beyond an edge."""
+    place = max(distance_m, 0.0) / pad.overhang_step_m
+    k = int(place)
+    if k > len(pad.overhangs) - 2:
+        return 0.0
+    return pad.overhangs[k] + (place - k) * (pad.overhangs[k + 1] - pad.overhangs[k])
 
 
 def _add_square(whitening: Whitening) -> None:

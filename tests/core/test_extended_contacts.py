@@ -1,0 +1,113 @@
+"""Contacts that are no points in the simulator's physics: patches over an edge, several patches."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch import config
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.pad_model import PadModel
+from handtouch.field.contact_law import ForceEstimateStatus
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import WORLDS
+from tests.deployments import deployment_text, pad_text
+
+FloatArray = NDArray[np.float64]
+TEXT = deployment_text(pad_text("plane", 1), channel="none", full_scale_ma=40.0)
+ELONGATION_STD = 0.6
+
+
+def deployed(**sheet: float) -> config.Deployment:
+    deployment = config.parse(TEXT)
+    made = deployment.sheets["s"].model_copy(update=sheet)
+    return deployment.model_copy(update={"sheets": {"s": made}})
+
+
+def virtual_hand(deployment: config.Deployment, *touches: dict[str, Any]) -> VirtualHand:
+    held = {"link": "plane", "from_s": 0.0, "duration_s": 10.0}
+    given = [held | touch for touch in touches or ({"path": ((0.5, 0.5),), "force_n": (1.0,)},)]
+    return VirtualHand(deployment, Scenario.model_validate({"touch": given}), WORLDS["ideal"].draw(1))
+
+
+def solve(model: PadModel, currents: FloatArray) -> dict[str, FloatArray]:
+    """Return the values of contacts with these currents (n, 4), each by itself."""
+    every, rows = np.zeros((1, 4)), []
+    values = np.full((1, VALUE_COUNT), np.nan)
+    solver = make_solver(model, every, np.zeros(1), np.ones(1, np.bool_), values)
+    for own in currents:
+        every[0], values[0] = own, np.nan
+        solver.solve_contacts(np.zeros(1, np.intp).data)
+        rows.append(values[0].copy())
+    return {name: np.array(rows)[:, where] for name, where in VALUE_SLICES.items()}
+
+
+def elongated_at_an_edge(elongation_std: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return errors and standard deviations [m] across the edge x0 of contacts 0.3 to 2 mm from it."""
+    stated = deployed(contact_elongation_std=elongation_std)
+    hand, rng = virtual_hand(stated), np.random.default_rng(5)
+    length_m, _ = hand.virtual_pads[0].circuit.size_m
+    position = np.stack([rng.uniform(3e-4, 2e-3, count) / length_m, rng.uniform(0.3, 0.7, count)])
+    ratio = np.exp(ELONGATION_STD * np.abs(rng.normal(size=count)))
+    focus_m = 2.5e-3 * np.sqrt(ratio - 1 / ratio)
+    direction = rng.uniform(0, np.pi, count)
+    patch = np.stack([np.full(count, 2.5e-3), focus_m * np.cos(direction), focus_m * np.sin(direction)])
+    single = [
+        hand.solve_contacts(np.zeros(1, np.intp), position[:, [k]], patch[:, [k]], np.ones(1))[0][0]
+        for k in range(count)
+    ]
+    model = PadModel(stated)
+    found = solve(model, np.array(single))
+    return (
+        found["pad_m"][:, 0] - position[0] * length_m,
+        np.sqrt(found["covariance_m2"][:, 0]),
+    )
+
+
+def test_current_that_hangs_over_an_edge_enters_at_the_edge() -> None:
+    stated = deployed()
+    hand, model = virtual_hand(stated), PadModel(stated)
+    length_m, _ = hand.virtual_pads[0].circuit.size_m
+    along = np.cos(np.linspace(0, np.pi, 2001))
+    density = np.sqrt(1 - along**2) * np.sqrt(1 - along**2)  # of the angle
+    for distance_m, focus_m in ((1e-3, 2e-3), (1e-3, 4e-3), (2e-3, 2e-3)):
+        place = np.array([[distance_m / length_m], [0.5]])
+        patch = np.array([[2.5e-3], [focus_m], [0.0]])
+        currents, _ = hand.solve_contacts(np.zeros(1, np.intp), place, patch, np.ones(1))
+        centre_m = np.average(np.maximum(distance_m + focus_m * along, 0.0), weights=density)
+        found_m = solve(model, currents)["pad_m"][0, 0]
+        assert found_m == pytest.approx(centre_m, abs=0.03e-3)
+
+
+def test_positions_of_elongated_contacts_that_hang_over_an_edge_hold() -> None:
+    error, std = elongated_at_an_edge(ELONGATION_STD, 150)
+    assert error.mean() > 5e-5  # positions are farther inside
+    assert np.mean(np.abs(error) < 1.96 * std) > 0.9
+    _, round_std = elongated_at_an_edge(0.0, 40)
+    assert np.median(std) < 5e-4
+    assert np.median(round_std) < 0.5 * np.median(std)  # round contacts pay nothing
+
+
+@pytest.mark.parametrize("total_n", [0.3, 1.0, 2.0])
+def test_the_force_of_two_patches_is_within_its_interval(total_n: float) -> None:
+    two: list[dict[str, Any]] = [{"path": ((x, 0.5),), "force_n": (total_n / 2,)} for x in (0.25, 0.75)]
+    deployment = deployed()
+    hand, model = virtual_hand(deployment, *two), PadModel(deployment)
+    counts = hand.counts(0, np.array([5.0]))
+    found = solve(model, counts * model.ampere_per_count[0])
+    assert found["squared_misfit"][0, 0] > 9.0
+    assert found["force_status"][0, 0] == ForceEstimateStatus.VALID
+    assert abs(found["force_n"][0, 0] - total_n) < 1.96 * found["force_std_n"][0, 0]
+
+
+def test_two_patches_at_the_sheets_limit_give_a_bound_below_their_force() -> None:
+    total_n = 60.0
+    two: list[dict[str, Any]] = [{"path": ((x, 0.5),), "force_n": (total_n / 2,)} for x in (0.25, 0.75)]
+    hand, model = virtual_hand(deployed(), *two), PadModel(deployed())
+    found = solve(model, hand.counts(0, np.array([5.0])) * model.ampere_per_count[0])
+    assert found["force_status"][0, 0] == ForceEstimateStatus.LOWER_BOUND
+    assert 0 < found["force_n"][0, 0] < total_n
