@@ -21,6 +21,7 @@ from handtouch.node.identity_store import IdentityStore
 from handtouch.node.iio import IioDevice
 from handtouch.node.noise import measure_noise
 from handtouch.node.settings import load
+from tests.node.conftest import NodeBench
 from tests.node.stand_in import AdcStandIn, raw_of_ma
 
 MS = 1_000_000
@@ -45,6 +46,29 @@ def test_boot_up_and_a_sample_at_sync_have_the_calibrated_currents(bench: Any) -
     assert bench.counts() == pytest.approx(counts_of_ma([0.5, 2.0, -0.5, 2.0]), abs=1)
     assert bench.read_object(0x1018, 4) == 77
     assert bench.read_object(0x6401, 4) == pytest.approx(counts_of_ma([2.0])[0], abs=1)
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_a_pad_may_have_another_number_of_channels(tmp_path: Path, count: int) -> None:
+    adc = AdcStandIn(tmp_path, channels=count)
+    bench = NodeBench(tmp_path, adc)
+    try:
+        currents_ma = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0][:count]
+        adc.set_raw(raw_of_ma(currents_ma))
+        channels = ", ".join(f'"voltage{k}"' for k in range(count))
+        bench.start(
+            pad=f'[[pad]]\nname = "tip"\nnode_id = 5\nserial = 77\nadc = "main"\ngain_ohm = -240.0\n'
+            f"channels = [{channels}]"
+        )
+        bench.sync()
+        read = [bench.read_object(0x6401, sub + 1) for sub in range(count)]
+        assert read == pytest.approx(counts_of_ma(currents_ma), abs=1)
+        adc.set_raw([*raw_of_ma(currents_ma[:-1]), 1 << 30])
+        emergencies = [data for _ in range(5) for identifier, data in bench.sync() if identifier == 0x85]
+        assert [data[4] for data in emergencies] == [1 << count - 1]
+    finally:
+        bench.service.close()
+        adc.close()
 
 
 def test_offset_and_scale_of_iio_may_be_shared_by_all_channels(bench: Any) -> None:

@@ -145,14 +145,21 @@ class DeviceBus:
         spec = DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels)
         return self._append_lss_device(UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares))
 
-    def add_stored(self, serial: int, node_id: int | None, store: StoreId) -> UnconfiguredDevice:
-        """Add a node of the shipped EDS with a stored id, None for none, whose inputs the sampler measures.
+    def add_stored(
+        self, serial: int, node_id: int | None, store: StoreId, channels: int = CHANNELS
+    ) -> UnconfiguredDevice:
+        """Add a node of a shipped EDS with a stored id, None for none, whose inputs the sampler measures.
 
         `store` is called for an id that LSS has stored. Raises ValueError for an id in use.
         """
         if node_id in (device.lss.stored_id for device in self._unconfigured if node_id is not None):
             raise ValueError(f"node_id must be used once, got {node_id}")
-        spec = DeviceSpec(_eds_path(None), serial=serial, simulates_excitation=False)
+        addresses = tuple((cia301.ANALOGUE_INPUTS, sub + 1) for sub in range(channels))
+        spec = DeviceSpec(
+            *(_eds_path(None, channels), None, None, serial, addresses),
+            counts_per_unit=(None,) * channels,
+            simulates_excitation=False,
+        )
         return self._append_lss_device(
             UnconfiguredDevice(self, self._rows, spec, node_id=node_id, store=store)
         )

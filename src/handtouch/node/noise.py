@@ -23,9 +23,9 @@ from handtouch.node.settings import NodeFile, NodePad
 
 @dataclass(frozen=True)
 class PadNoise:
-    """Noise of an untouched pad's four channels.
+    """Noise of an untouched pad's c channels.
 
-    `mean_ma`, `std_ma` : mean and standard deviation (4,) of the currents [mA]; `std_counts` : (4,), of
+    `mean_ma`, `std_ma` : mean and standard deviation (c,) of the currents [mA]; `std_counts` : (c,), of
     published counts, before their rounding; `samples` : their number
     """
 

@@ -17,7 +17,6 @@ from handtouch.node.iio import FloatArray
 from handtouch.node.settings import NodePad, Trim
 
 MAX_COUNT = 32767
-_ALL_CHANNELS = 0b1111
 _SATURATED_SAMPLES = 3  # in succession, before a channel is reported
 _SATURATED_HOLD_NS = 1_000_000_000  # since the last one, before it is reported as recovered
 
@@ -27,7 +26,7 @@ _log = logging.getLogger("handtouch.node")
 class PadInput:
     """Converts raw values of a pad to counts, and reports its failures.
 
-    `columns` : of its four channels in its ADC's readings; `node` : its CANopen node, None without one;
+    `columns` : of its c channels in its ADC's readings; `node` : its CANopen node, None without one;
     `has_sample` : False while its ADC has failed or hasn't converted. Without a sample the node sends no
     TPDO, so that no old value passes for a new one; its NMT state stays.
     """
@@ -39,10 +38,13 @@ class PadInput:
         self._volt_per_unit = np.array(
             [1.0 if channel.startswith("current") else pad.gain_ohm for channel in pad.channels]
         )
-        self._gain, self._offset_ma = np.array(trim.gain), np.array(trim.offset_ma)
+        count = len(pad.channels)
+        self._gain, self._offset_ma = np.array(trim.gain or (1.0,) * count), np.zeros(count)
+        if trim.offset_ma is not None:
+            self._offset_ma = np.array(trim.offset_ma)
         self.has_sample = False
         self._faults: dict[AdcFaultKind, bytes] = {}
-        self._saturated_samples = np.zeros(4, np.int64)
+        self._saturated_samples = np.zeros(count, np.int64)
         self._saturated_ns = 0
 
     @property
@@ -61,20 +63,20 @@ class PadInput:
         return None if self._node is None else self._node.device
 
     def currents_ma(self, raw: FloatArray, scale: FloatArray, offset: FloatArray) -> FloatArray:
-        """Return the currents (..., 4) [mA] of raw values (..., 4).
+        """Return the currents (..., c) [mA] of raw values (..., c).
 
-        `scale`, `offset` : of the channels (4,), to mV as in IIO, or to mA for channels currentN
+        `scale`, `offset` : of the channels (c,), to mV as in IIO, or to mA for channels currentN
         """
         measured = (raw + offset) * scale / self._volt_per_unit
         return np.asarray((measured - self._offset_ma) * self._gain)
 
     def counts(self, currents_ma: FloatArray) -> NDArray[np.int64]:
-        """Return the counts (..., 4) of currents, limited to 16 bits."""
+        """Return the counts (..., c) of currents, limited to 16 bits."""
         counts = np.rint(currents_ma * self.counts_per_ma)
         return np.clip(counts, -MAX_COUNT - 1, MAX_COUNT).astype(np.int64)
 
     def record_sample(self, at_limit: NDArray[np.bool_], now_ns: int) -> None:
-        """Record a successful sample; `at_limit` (4,): the channels at an end of their ranges."""
+        """Record a successful sample; `at_limit` (c,): the channels at an end of their ranges."""
         self.has_sample = True
         for kind in self.faults:
             if _is_of_adc(kind):
@@ -90,9 +92,10 @@ class PadInput:
         self.has_sample = False
         self._allow_data()
 
-    def record_failure(self, error: AdcError, channels: int = _ALL_CHANNELS) -> None:
-        """Record a failed sample, or a failed switch; `channels`: bit mask of those concerned."""
-        data = bytes((error.kind, channels)) + error.number.to_bytes(2, "little") + b"\0"
+    def record_failure(self, error: AdcError, channels: int | None = None) -> None:
+        """Record a failed sample, or a failed switch; `channels`: mask of those concerned, default: all."""
+        mask = (1 << len(self.pad.channels)) - 1 if channels is None else channels
+        data = bytes((error.kind, mask & 0xFF)) + error.number.to_bytes(2, "little") + bytes((mask >> 8,))
         if _is_of_adc(error.kind):
             self.record_no_sample()
         if self._faults.get(error.kind) == data:

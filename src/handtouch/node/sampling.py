@@ -96,7 +96,7 @@ class AdcInput:
         self._retry_ns, self._due_ns = 0, 0
 
     def sample(self, counts: NDArray[np.int64], now_ns: int, sync_ns: int | None) -> None:
-        """Write the counts of its pads into their rows of `counts` (pads, 4); report failures by EMCY."""
+        """Write the counts of its pads into their rows of `counts` (pads, c); report failures by EMCY."""
         if not self._is_open and now_ns < self._due_ns:
             self.failures += 1
             return
@@ -114,21 +114,23 @@ class AdcInput:
             self.timing.add(sync_ns, reading.sample_ns, reading.span_ns, reading.is_timed)
         currents = self._currents_ma(reading)
         for pad, row, current_ma in zip(self.pads, self.rows, currents, strict=True):
-            counts[row] = pad.counts(current_ma)
+            own = counts[row, : len(current_ma)]
+            own[:] = pad.counts(current_ma)
             raw = reading.raw[pad.columns]
             low, high = self._reader.limits[pad.columns].T
-            at_limit = (raw <= low) | (raw >= high) | (counts[row] >= MAX_COUNT) | (counts[row] < -MAX_COUNT)
+            at_limit = (raw <= low) | (raw >= high) | (own >= MAX_COUNT) | (own < -MAX_COUNT)
             pad.record_sample(at_limit, now_ns)
 
     def read_currents_ma(self) -> list[FloatArray] | None:
-        """Return the currents (4,) of each pad [mA], None without a recent conversion. Raises AdcError."""
+        """Return the currents (c,) of each pad [mA], None without a recent conversion. Raises AdcError."""
         reading = self._read()
         return None if reading is None else self._currents_ma(reading)
 
     def maintain(self, now_ns: int) -> None:
         """Keep the buffer from filling; sample a pad that has none, which reopens a closed ADC when due."""
         if not all(pad.has_sample for pad in self.pads):
-            self.sample(np.zeros((max(self.rows) + 1, 4), np.int64), now_ns, None)
+            most = max(len(pad.columns) for pad in self.pads)
+            self.sample(np.zeros((max(self.rows) + 1, most), np.int64), now_ns, None)
             return
         try:
             self._reader.drain()
@@ -169,10 +171,14 @@ class Sampling:
         self.adcs = tuple(adcs)
         self.sync_ns: int | None = None
         rows = sum(len(adc.rows) for adc in self.adcs)
-        self._counts = np.zeros((rows, 4), np.int64)
+        most = max(len(pad.columns) for adc in self.adcs for pad in adc.pads)
+        self._counts = np.zeros((rows, most), np.int64)
 
     def __call__(self, now_ns: int) -> NDArray[np.int64]:
-        """Return counts (pads, 4); those of a pad whose ADC has failed are the last ones, and aren't sent."""
+        """Return counts (pads, c), c of the pad with most channels.
+
+        Those of a pad whose ADC has failed are the last ones, and aren't sent.
+        """
         for adc in self.adcs:
             adc.sample(self._counts, now_ns, self.sync_ns)
         return self._counts
@@ -199,11 +205,13 @@ def make_inputs(
     settings, inputs = file.settings, []
     for name, adc in settings.adcs.items():
         rows = [row for row, pad in enumerate(settings.pads) if pad.adc == name]
-        channels = [channel for row in rows for channel in settings.pads[row].channels]
-        pads = [
-            PadInput(settings.pads[row], file.trims[row], list(range(4 * at, 4 * at + 4)), nodes[row])
-            for at, row in enumerate(rows)
-        ]
+        channels: list[str] = []
+        pads = []
+        for row in rows:
+            own = settings.pads[row].channels
+            columns = list(range(len(channels), len(channels) + len(own)))
+            pads.append(PadInput(settings.pads[row], file.trims[row], columns, nodes[row]))
+            channels += own
         if rows:
             reader = _make_reader(adc, channels, Path(settings.sysfs), Path(settings.devices), clock)
             inputs.append(AdcInput(name, reader, pads, rows))

@@ -145,7 +145,9 @@ class NodeService:
 
     def _add_node(self, pad: NodePad) -> UnconfiguredDevice:
         identity = self._store.identity(pad.name, pad.serial, pad.node_id)
-        node = self.devices.add_stored(identity.serial, identity.node_id, partial(self._store_id, pad.name))
+        node = self.devices.add_stored(
+            identity.serial, identity.node_id, partial(self._store_id, pad.name), len(pad.channels)
+        )
         shown = "none; assign one by LSS" if identity.node_id is None else f"0x{identity.node_id:02X}"
         _log.info("pad %s: serial number %d, node id %s", pad.name, identity.serial, shown)
         return node

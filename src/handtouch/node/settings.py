@@ -18,10 +18,13 @@ from handtouch.config.base import Table
 from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
 from handtouch.config.tables import Name, NodeId, Positive
 from handtouch.config.toml_text import parse_toml, read_text
+from handtouch.device.inputs import MAX_CHANNELS, MIN_CHANNELS
 
 Channel = Annotated[str, Field(pattern=r"^(voltage|current)\d+(-(voltage|current)\d+)?$")]
-FourChannels = Annotated[tuple[Channel, Channel, Channel, Channel], Field(strict=False)]
-PerChannel = Annotated[tuple[float, float, float, float], Field(strict=False)]
+PadChannels = Annotated[
+    tuple[Channel, ...], Field(strict=False, min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)
+]
+PerChannel = Annotated[tuple[float, ...], Field(strict=False)]
 Serial = Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 _Model = TypeVar("_Model", bound=Table)
 _MAX_DRAIN_PERIOD_S = 0.1  # between two readings of a buffer's queue, on a busy machine
@@ -77,11 +80,11 @@ class Excitation(Table):
 
 
 class Trim(Table):
-    """Trim file of a pad: corrections of its four channels, from a measurement with known currents."""
+    """Trim file of a pad: corrections of its channels, from a measurement with known currents."""
 
-    gain: PerChannel = Field((1.0, 1.0, 1.0, 1.0), description="factors of the currents")
-    offset_ma: PerChannel = Field(
-        (0.0, 0.0, 0.0, 0.0), description="currents measured without any, subtracted before the factors"
+    gain: PerChannel | None = Field(None, description="factors of the currents; default: 1 for each")
+    offset_ma: PerChannel | None = Field(
+        None, description="currents measured without any, subtracted before the factors; default: 0 for each"
     )
 
 
@@ -96,8 +99,9 @@ class NodePad(Table):
         None, description="serial number, 0x1018 sub 4; default: a random one, kept in the state file"
     )
     adc: str = Field(description="name of its [adc.NAME]")
-    channels: FourChannels = Field(
-        description="IIO channels of 0x6401:01 to :04, e.g. voltage0, or voltage0-voltage1 (differential)"
+    channels: PadChannels = Field(
+        description="IIO channels of 0x6401:01 and those after it, one for each electrode (3 to 16), e.g. "
+        "voltage0, or voltage0-voltage1 (differential)"
     )
     gain_ohm: float = Field(
         description="volts at the ADC per ampere into the electrode, negative for an inverting amplifier; "
@@ -116,7 +120,7 @@ class NodePad(Table):
         if self.gain_ohm == 0:
             raise ValueError("gain_ohm must not be 0: it is the feedback resistance of the amplifiers")
         if len(set(self.channels)) < len(self.channels):
-            raise ValueError("channels must be four different ones")
+            raise ValueError("channels must be different ones")
         return self
 
 
@@ -174,9 +178,7 @@ def load(path: Path) -> NodeFile:
     settings = _read(path, TouchNode, TABLES)
     if problems := tuple(_problems_in(settings)):
         raise ConfigError(str(path), problems)
-    trims = tuple(
-        _read(path.parent / pad.trim, Trim, {"": Trim}) if pad.trim else Trim() for pad in settings.pads
-    )
+    trims = tuple(_read_trim(path.parent, pad) for pad in settings.pads)
     return NodeFile(settings, trims, _state_path(path, settings))
 
 
@@ -192,6 +194,20 @@ def _read(path: Path, model: type[_Model], tables: Tables) -> _Model:
         return model.model_validate(raw)
     except ValidationError as error:
         raise ConfigError(str(path), problems_of(raw, error, tables, {})) from error
+
+
+def _read_trim(folder: Path, pad: NodePad) -> Trim:
+    if pad.trim is None:
+        return Trim()
+    trim = _read(folder / pad.trim, Trim, {"": Trim})
+    problems = [
+        Problem(key, f" = {list(values)}", f"must have {len(pad.channels)} values, one for each channel")
+        for key, values in (("gain", trim.gain), ("offset_ma", trim.offset_ma))
+        if values is not None and len(values) != len(pad.channels)
+    ]
+    if problems:
+        raise ConfigError(str(folder / pad.trim), tuple(problems))
+    return trim
 
 
 def _problems_in(settings: TouchNode) -> Iterator[Problem]:
