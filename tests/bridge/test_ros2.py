@@ -75,6 +75,10 @@ LOCATED = replace(
     palm_covariance_m2=(1e-6,) * 9,
     group=3,
     diagnoses=("gum", "drift"),
+    force_vector_status="valid",
+    force_vector_n=(0.3, -1.5, -2.0),
+    force_vector_covariance_n2=(1e-2,) * 9,
+    palm_force_vector_n=(1.5, 0.3, -2.0),
 )
 
 

@@ -22,6 +22,7 @@ from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.pads import mount_transform
 from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate import grasp as grasping
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.grasp.event_score import (
     EventScore,
     compare_contacts,
@@ -34,6 +35,7 @@ from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.grasp.patches import ContactPatches, clip_to_pad, contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, hand_contacts, simulate_grasp
+from handtouch.simulate.grasp.tangential import pad_forces
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World
@@ -313,3 +315,19 @@ def test_pads_of_every_surface_fit_into_a_scene(kind: str) -> None:
     geom = scene.model.geom(f"pad {pads[0].link}")
     assert scene.pad_row_by_geom[geom.id] == 0
     assert scene.pads[0].shape == simulated_surface(SURFACE_TABLES[kind])
+
+
+def test_tangential_forces_of_a_grasp_lie_in_the_friction_cone(
+    ball: GraspRecord, pressed: ContactPatches
+) -> None:
+    stimulus = GraspStimulus.from_grasp(ball, pressed)
+    times_s = np.arange(len(pressed.total_n)) * TIME_STEP_S
+    pulled = 0.0
+    for row, pad in enumerate(ball.pads):
+        forces = pad_forces(ball, row)
+        found = stimulus.pad_stimulus(pad.link, lambda _: ContactPatch(1e-3)).tangential_n(times_s)
+        np.testing.assert_array_equal(found, forces.tangential_n)
+        size = np.hypot(*found)
+        assert (size <= ball.grasped_object.friction * forces.normal_n + 1e-6).all()
+        pulled = max(pulled, float(size.max()))
+    assert pulled > 0.3  # the hand holds the ball's weight

@@ -117,6 +117,11 @@ def _contact_values(contact: wire.Contact, stamper: Stamper) -> tuple[Any, ...]:
         _number(contact.joints_age_s),
         contact.diagnoses,
         contact.fresh,
+        _FORCE_STATUS[contact.force_vector_status],
+        *(contact.force_vector_n or _UNKNOWN_3),
+        *(contact.force_vector_covariance_n2 or _UNKNOWN_9),
+        *(contact.palm_force_vector_n or _UNKNOWN_3),
+        *(contact.base_force_vector_n or _UNKNOWN_3),
     )
 
 

@@ -242,6 +242,11 @@ class RosContact(IdlStruct, typename="handtouch_msgs::msg::dds_::Contact_"):
     joints_age_s: float64
     diagnoses: Annotated[Sequence[str], sequence(str)]
     fresh: bool
+    force_vector_status: uint8
+    force_vector_n: Vector3
+    force_vector_covariance_n2: Annotated[Sequence[float64], array(float64, 9)]
+    palm_force_vector_n: Vector3
+    base_force_vector_n: Vector3
 
 
 @dataclass
