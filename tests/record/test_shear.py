@@ -15,6 +15,7 @@ from handtouch.config import parse
 from handtouch.core.events import BaselineEvent
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.reload import find_changes
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.tare import TareJob
 from handtouch.record.exact_replay import ExactReplay
@@ -142,3 +143,25 @@ def test_recorded_ticks_have_the_counts_of_all_channels(recorded: Any) -> None:
     rows = [row for table, row in rows_of(Recording(recorded[0])) if table == "raw"]
     assert rows[5]["channel5_counts"] > 1000
     assert rows[120]["x0_counts"] > 100
+
+
+@pytest.mark.parametrize(
+    ("change", "changed_keys", "is_kept"),
+    [
+        (("begin_threshold_n = 0.1", "begin_threshold_n = 0.2"), ["touch"], True),
+        (("[12.0, 10.0]", "[11.0, 10.5]"), ["shear.crossed"], False),
+    ],
+    ids=["threshold", "calibrated stiffness"],
+)
+def test_a_reload_keeps_the_rest_position_unless_the_shear_pad_changed(
+    make_shear_hand: Callable[..., ShearHand], change: tuple[str, str], changed_keys: list[str], is_kept: bool
+) -> None:
+    hand = make_shear_hand()
+    for _ in range(100):
+        hand.press(0.0, (0.05e-3, 0.0))
+    deployment = parse(shear_deployment(KINDS).replace(*change))
+    changes, _ = find_changes(hand.deployment, deployment)
+    assert changes == {0: changed_keys}
+    hand.pipeline.replace_model(PadModel(deployment), [*changes])
+    hand.press(0.0, (0.05e-3, 0.0))
+    assert np.isfinite(hand.pipeline.state.shear_rest_m[0, 0]) == is_kept

@@ -321,7 +321,7 @@ def test_tangential_forces_of_a_grasp_lie_in_the_friction_cone(
     ball: GraspRecord, pressed: ContactPatches
 ) -> None:
     stimulus = GraspStimulus.from_grasp(ball, pressed)
-    times_s = np.arange(len(pressed.total_n)) * TIME_STEP_S
+    times_s = np.asarray(np.arange(len(pressed.total_n)) * TIME_STEP_S, np.float64)
     pulled = 0.0
     for row, pad in enumerate(ball.pads):
         forces = pad_forces(ball, row)

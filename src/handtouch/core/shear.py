@@ -1,6 +1,7 @@
 """Force vectors of contacts above shear pads: the compiled stage on the tables of a deployment.
 
-Public names: `ShearForces`, `ShearParameters`, `shear_parameters`. Derivation: docs/shear.md.
+Public names: `ShearForces`, `ShearParameters`, `shear_parameters`, `changed_shear_pads`. Derivation:
+docs/shear.md.
 """
 
 from __future__ import annotations
@@ -34,6 +35,11 @@ class ShearParameters(NamedTuple):
     unknowns: int
     points: FloatArray
     numbers: FloatArray
+
+    def equals(self, other: ShearParameters) -> bool:
+        """Return True if all parameters are the same."""
+        points, numbers = (self.points, other.points), (self.numbers, other.numbers)
+        return self[:3] == other[:3] and np.array_equal(*points) and np.array_equal(*numbers)
 
     def table(self) -> ShearTable:
         """Return the table for the stage."""
@@ -117,6 +123,12 @@ def shear_parameters(
         for row, (_, pad) in enumerate(deployment.pads)
         if pad.shear
     ]
+
+
+def changed_shear_pads(old: Sequence[ShearParameters], new: Sequence[ShearParameters]) -> list[int]:
+    """Return the pads above shear pads that differ."""
+    before = {shear.pad: shear for shear in old}
+    return [shear.pad for shear in new if shear.pad not in before or not shear.equals(before[shear.pad])]
 
 
 def _parameters(

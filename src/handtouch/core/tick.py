@@ -17,7 +17,7 @@ from handtouch.core.contact_solver import VALUE_SLICES, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
-from handtouch.core.shear import ShearForces
+from handtouch.core.shear import ShearForces, changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.publish import PUBLISHED_SLICES, PUBLISHED_VALUES, ContactColumns
@@ -226,9 +226,10 @@ class TickProcessor:
         self.sheet_force = self.sheet_force.with_behaviours(self.model.behaviours, model.behaviours)
         for pad in changed.tolist():
             self.sheet_force.reset_evidence(pad)
+        moved = changed_shear_pads(self.model.shear_pads, model.shear_pads)
         self.model = model
         self._set_stages(model)
-        self.shear.forget_rest(changed.tolist())
+        self.shear.forget_rest(moved)
         self.refresh()
         self.discard_solutions(changed)
 

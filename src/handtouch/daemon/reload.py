@@ -103,12 +103,14 @@ def find_changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]]
         what = _changed_keys(before, after)
         what += [f"node.{after.node}"] * (old.nodes[before.node] != new.nodes[after.node])
         what += [f"sheet.{after.sheet}"] * (old.sheets[before.sheet] != new.sheets[after.sheet])
+        shears = old.shears.get(before.shear), new.shears.get(after.shear)
+        what += [f"shear.{after.shear}"] * (shears[0] != shears[1])
         if (before.touch or old.touch) != (after.touch or new.touch) and "touch" not in what:
             what.append("touch")
         if what:
             pads[number] = what
     tables = [name for name in ("daemon", "scene", "touch") if getattr(old, name) != getattr(new, name)]
-    for name in ("nodes", "sheets"):
+    for name in ("nodes", "sheets", "shears"):
         before_all, after_all = getattr(old, name), getattr(new, name)
         keys = sorted(before_all.keys() | after_all.keys())
         tables += [f"{name[:-1]}.{key}" for key in keys if before_all.get(key) != after_all.get(key)]
