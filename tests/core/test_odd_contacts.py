@@ -34,7 +34,7 @@ def fill_state(state: TickState, rng: np.random.Generator) -> None:
     """Write odd numbers into a state."""
     for column in (
         *(state.values, state.peak_force_n, state.total_current_a, state.uncompensated_force_n),
-        state.palm_values,
+        *(state.palm_values, state.force_vector, state.frame_force_vector),
     ):
         column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.3 else rng.normal(size=column.shape)
     state.total_current_a[:] = rng.normal(size=state.pads)  # of finite counts
@@ -44,6 +44,7 @@ def fill_state(state: TickState, rng: np.random.Generator) -> None:
     state.solved[:], state.known[:] = True, True
     for truths in (state.palm_requested, state.base_requested, state.synchronous):
         truths[:] = rng.random(state.pads) < 0.5
+    state.force_vector_status[:] = rng.integers(len(ForceStatus), size=state.pads)
     state.palm_status[:], state.base_status[:] = rng.integers(len(FrameStatus), size=(2, state.pads))
 
 
@@ -103,6 +104,17 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
                     values if status == FrameStatus.VALID else None
                 )
                 at += width
+        vectors = {
+            "force_vector_n": state.force_vector[pad, :3],
+            "force_vector_covariance_n2": state.force_vector[pad, 3:],
+            "palm_force_vector_n": state.frame_force_vector[pad, :3],
+            "base_force_vector_n": state.frame_force_vector[pad, 3:],
+        }
+        vector_status = ForceStatus(state.force_vector_status[pad])
+        assert contact.force_vector_status == vector_status.text
+        for name, column in vectors.items():
+            present = vector_status != ForceStatus.NOT_COMPUTED
+            assert getattr(contact, name) == (finite(column) if present else None)
         later = number >= 200
         assert (len(contact.calibration_id), len(contact.diagnoses)) == ((300, 2) if later else (7, 0))
         assert contact.end_reason == ("stale" if event == "end" else "")

@@ -52,6 +52,8 @@ class ReadTransforms(ContactTransforms):
                 values = state.palm_values[pad, at : at + 15].tolist()
                 fields[f"{frame}_position_m"], fields[f"{frame}_normal"] = values[:3], values[3:6]
                 fields[f"{frame}_covariance_m2"] = values[6:]
+                first = 3 * (frame == "base")
+                fields[f"{frame}_force_vector_n"] = state.frame_force_vector[pad, first : first + 3].tolist()
         return fields
 
 
@@ -70,6 +72,7 @@ class TouchedHand:
             self.columns.position_m[pad] = rng.normal(size=3) * 0.01
             normal = rng.normal(size=3)
             self.columns.normal[pad] = normal / np.linalg.norm(normal)
+            self.transforms.state.force_vector[pad, :3] = rng.normal(size=3)
             root = rng.normal(size=(3, 2)) * 1e-4
             self.columns.covariance_m2[pad] = root @ root.T
         self.columns.sample_ns[:] = 100 * MS
@@ -110,6 +113,8 @@ def test_position_normal_and_covariance_are_transformed_by_the_pose_of_the_link(
             np.testing.assert_allclose(
                 contact[f"{name}_normal"], pose.rotation @ columns.normal[pad], atol=1e-12
             )
+            turned = pose.rotation @ touched.transforms.state.force_vector[pad, :3]
+            np.testing.assert_allclose(contact[f"{name}_force_vector_n"], turned, atol=1e-12)
             covariance = np.reshape(contact[f"{name}_covariance_m2"], (3, 3))
             rotated = pose.rotation @ columns.covariance_m2[pad] @ pose.rotation.T
             np.testing.assert_allclose(covariance, rotated, atol=1e-18)
