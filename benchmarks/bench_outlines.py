@@ -9,6 +9,7 @@ import importlib.util
 import json
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,9 @@ from numpy.typing import NDArray
 from page import made_by, options, output_folder, progress, table
 from skfem import ElementTriP2, ElementTriP3, ElementTriP4
 
+from handtouch.config import Deployment, load, shipped
+from handtouch.core.contact_solver import VALUE_COUNT, make_solver
+from handtouch.core.pad_model import PadModel
 from handtouch.field import BoundaryElectrode, ElectrodeNetwork, Outline, OutlineNetwork
 
 matplotlib.use("Agg")
@@ -34,6 +38,8 @@ INSET = 0.01  # of the larger extent: least distance of points from the boundary
 POINTS = 400
 NOISE = 0.01  # of the total, on each channel
 INFORMATION_MARGIN = 0.1  # of the extent
+COST_ELECTRODES, COST_CONTACTS = (3, 4, 6, 8, 12, 16), 2000
+OUTLINE_MM = 56.548  # of the fingertip in config/electrodes.toml
 GAP_SHARE = 0.1  # of the pitch of the electrodes
 
 
@@ -225,6 +231,63 @@ def information(quick: bool) -> list[Row]:
     return rows
 
 
+def one_pad(electrodes: int) -> Deployment:
+    """Return a deployment of one pad: a round fingertip with equal arcs, or for 0 a plane with four sides."""
+    whole = load(shipped.path("electrodes.toml" if electrodes else "utah_mit.toml"))
+    hand, pad = whole.hands[0], whole.hands[0].pads[0]
+    nodes = dict(whole.nodes)
+    if electrodes:
+        ends = np.linspace(0.0, OUTLINE_MM, electrodes + 1)
+        arcs = {f"e{k}": (float(a) + 0.5, float(b) - 0.5) for k, (a, b) in enumerate(pairwise(ends))}
+        changes = {
+            "electrode_arcs_mm": arcs,
+            "electrodes": tuple(arcs),
+            "series_ohm": (0.0,) * electrodes,
+            "gap_offsets_mm": ((0.0, 0.0),) * electrodes,
+        }
+        pad = pad.model_copy(update=changes)
+        channels = tuple(f"0x6401:{sub + 1}" for sub in range(electrodes))
+        kind = {"channels": channels, "channel_scale": (1.0,) * electrodes}
+        nodes[pad.node] = nodes[pad.node].model_copy(update=kind)
+    hands = (hand.model_copy(update={"pads": (pad,)}),)
+    return whole.model_copy(update={"hands": hands, "nodes": nodes})
+
+
+def costs(quick: bool) -> list[Row]:
+    """Return the time of a contact in the daemon's stages and the size of a pad's tables, by electrodes."""
+    rows = []
+    for electrodes in (0, 4) if quick else (0, *COST_ELECTRODES):
+        begin_s = time.process_time()
+        model = PadModel(one_pad(electrodes))
+        build_s = time.process_time() - begin_s
+        network, rng = model.networks[0], np.random.default_rng(1)
+        x, y = rng.uniform(0.1, 0.9, (2, 50 if quick else COST_CONTACTS)) * [[network.a], [network.b]]
+        readings = 2e-3 * network.fractions(x, y).T
+        readings += model.noise_a[0] * rng.normal(size=readings.shape)
+        given, values = np.zeros((1, model.channels)), np.full((1, VALUE_COUNT), np.nan)
+        solver = make_solver(model, given, np.zeros(1), np.ones(1, np.bool_), values)
+        pads = np.zeros(1, np.intp)
+        times_us: dict[str, list[float]] = {"new": [], "tracked": []}
+        for reading in readings:
+            for state, held in times_us.items():
+                given[0] = reading + model.noise_a[0] * rng.normal(size=model.channels)
+                values[:] = values if state == "tracked" else np.nan
+                begin_ns = time.perf_counter_ns()
+                solver.solve_contacts(pads.data)
+                held.append((time.perf_counter_ns() - begin_ns) / 1e3)
+        table = model.forward_tables[0]
+        rows.append(
+            {
+                "electrodes": f"{electrodes} on arcs" if electrodes else "4 on sides",
+                "new contact, us": float(np.median(times_us["new"])),
+                "tracked contact, us": float(np.median(times_us["tracked"])),
+                "tables, MB": (table.nodes.nbytes + table.tolerance_nodes.nbytes) / 1e6,
+                "build, CPU s": build_s,
+            }
+        )
+    return rows
+
+
 def draw(path: Path, accuracy: list[Row], bound: list[Row]) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2))
     for name in dict.fromkeys(row["outline, electrodes"] for row in accuracy):
@@ -249,7 +312,7 @@ def draw(path: Path, accuracy: list[Row], bound: list[Row]) -> None:
 def main() -> None:
     quick = options(__doc__).parse_args().quick
     known, accuracy = closed_forms(), convergence(quick)
-    mesh, bound = elements(quick), information(quick)
+    mesh, bound, cost = elements(quick), information(quick), costs(quick)
     page = [
         "# Pads of any outline",
         "",
@@ -282,10 +345,17 @@ def main() -> None:
             "of the area of the uncertainty over four electrodes.",
             bound,
         ),
+        *table(
+            "Cost in the daemon",
+            "Median time of one contact in the compiled stages: position, covariance with all tolerances, "
+            "force; a new contact, and one that is followed. Equal electrodes around a round fingertip, "
+            "beside a plane with four sides.",
+            cost,
+        ),
     ]
     folder = output_folder(quick)
     (folder / "outlines.md").write_text("\n".join(page))
-    data = {"closed_forms": known, "accuracy": accuracy, "elements": mesh, "information": bound}
+    data = {"closed_forms": known, "accuracy": accuracy, "elements": mesh, "information": bound, "cost": cost}
     (folder / "outlines.json").write_text(json.dumps(data, indent=1) + "\n")
     draw(folder / "outlines.png", accuracy, bound)
 
