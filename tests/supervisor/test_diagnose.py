@@ -16,7 +16,7 @@ from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, Normal, World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, ElectronicsSpread, Fixed, Normal, World
 from handtouch.supervisor.diagnose import (
     DiagnosisModel,
     HandDiagnostics,
@@ -67,7 +67,10 @@ def run(diagnosis: HandDiagnostics, counts: Callable[[Counts], NDArray[np.int64]
 
 
 def simulate(
-    fault: dict[str, object], length_s: float, series_ohm: tuple[float, ...] = (0.0,) * 4
+    fault: dict[str, object],
+    length_s: float,
+    series_ohm: tuple[float, ...] = (0.0,) * 4,
+    world: DrawnWorld | None = None,
 ) -> list[PadDiagnosis]:
     """Return the diagnoses of one pad of the virtual hand, pressed all over while it has a fault."""
     whole = config.load(shipped.path("utah_mit.toml"))
@@ -83,9 +86,8 @@ def simulate(
         for at in np.arange(0.5, length_s - 1, 1.0).tolist()
     )
     acting = FAULTS[str(fault["kind"])].model_validate(fault)
-    virtual = VirtualHand(
-        alone, Scenario(touch=touches), WORLDS["default"].only("parts", "contacts").draw(3), faults=(acting,)
-    )
+    world = world or WORLDS["default"].only("parts", "contacts").draw(3)
+    virtual = VirtualHand(alone, Scenario(touch=touches), world, faults=(acting,))
     diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"))
     run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
     return diagnosis.diagnoses()
@@ -292,6 +294,22 @@ def test_shorted_electrodes_are_observable_with_resistors() -> None:
     fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 0.0, "electrode": "x0", "to": "y0"}
     (found,) = simulate(fault, 60, series_ohm=(500.0,) * 4)
     assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("x0", "y0"))
+
+
+def test_short_on_a_sheet_of_another_resistance_is_no_saturated_channel() -> None:
+    fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 1.0, "electrode": "x0", "short_ohm": 20.0}
+    (found,) = simulate(fault, 25, world=WORLDS["harsh"].only("parts").draw(0))
+    assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("x0",))
+
+
+def test_saturation_under_a_lasting_contact_is_less_certain() -> None:
+    held, _ = play(lambda _, __: np.array([2000, 1500, 900, 1e6]), 25)
+    (found,) = held.diagnoses()
+    assert found.kind == FaultKind.SATURATED_CHANNEL
+    assert found.published.confidence < 0.7
+    rests, _ = play(lambda t, _: np.array([2000, 1500, 900, 1e6]) * [*[t < 22] * 3, 1], 25)
+    (found,) = rests.diagnoses()
+    assert found.published.confidence == 1.0
 
 
 def test_drift_of_several_pads_is_common_drift() -> None:

@@ -22,11 +22,13 @@ ALARM_NATS = 40.0
 _MIN_REPEATS = 200
 _MIN_RAILED_NS = 1_000_000_000
 _MIN_RAILED_TOUCHED_NS = 20_000_000_000
+_TOUCHED_CONFIDENCE = 0.6
+"""Of saturation without a moment at which the other channels rest."""
 _MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the others get from a contact anywhere
-_IDLE_RATIO_RANGE = (
-    0.7,
-    1.3,
-)  # of the currents that the layer's potential on an electrode drives into the others
+# of the currents that the layer's potential on an electrode drives into the others: their sum over that
+# of the nominal sheet, whose resistance isn't known better; and the deviation of each from the nominal share
+_IDLE_RATIO_RANGE = (0.3, 3.0)
+_MAX_IDLE_DEVIATION, _MAX_IDLE_DEVIATION_OF_SUM = 0.3, 0.03
 _FAULT_CLEAR_NS = 2_000_000_000
 
 
@@ -37,6 +39,7 @@ class ChannelFault:
     kind: FaultKind
     since_ns: int
     evidence: dict[str, float]
+    confidence: float = 1.0
 
 
 class ChannelFaultDetector:
@@ -87,7 +90,7 @@ class ChannelFaultDetector:
             if fault is not None:
                 self._healthy_since_ns[pad, channel] = -1
                 before = self.faults.get((pad, channel))
-                if before is None or before.kind != fault.kind:
+                if before is None or (before.kind, before.confidence) != (fault.kind, fault.confidence):
                     self.faults[pad, channel] = fault
         for pad, channel in list(self.faults):
             if railed[pad, channel] or not features.varied[pad, channel]:
@@ -111,16 +114,27 @@ class ChannelFaultDetector:
         least = np.delete(self._min_counts[pad, channel, own], channel)
         expected = np.delete(self._idle_counts[pad][channel], channel)
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
-        if (
-            count > 0
-            and (least > _IDLE_RATIO_RANGE[0] * expected).all()
-            and (least < _IDLE_RATIO_RANGE[1] * expected).all()
-        ):
+        if count > 0 and _matches_short(least, expected):
             return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
         untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
-        if untouched or count < 0 or lasted > _MIN_RAILED_TOUCHED_NS:
+        if untouched or count < 0:
             return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence)
+        if lasted > _MIN_RAILED_TOUCHED_NS:  # a contact all the time, or a short of an unusual sheet
+            return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence, _TOUCHED_CONFIDENCE)
         return None
+
+
+def _matches_short(least: FloatArray, expected: FloatArray) -> bool:
+    """Return whether the lowest counts (k,) of the other channels are those of a short to the layer.
+
+    No contact drives them so: next to an electrode, that takes most of its current.
+    """
+    ratio = float(least.sum() / expected.sum())
+    if not _IDLE_RATIO_RANGE[0] < ratio < _IDLE_RATIO_RANGE[1]:
+        return False
+    share = ratio * expected
+    allowed = _MAX_IDLE_DEVIATION * share + _MAX_IDLE_DEVIATION_OF_SUM * share.sum()
+    return bool((np.abs(least - share) < allowed).all())
 
 
 def _repeat_probability(std: FloatArray) -> FloatArray:

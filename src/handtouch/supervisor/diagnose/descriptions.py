@@ -83,7 +83,14 @@ def describe_channel_faults(
         since_ns = min(fault.since_ns for fault in of_kind.values())
         cause = cause.format(electrodes=" and ".join(names))
         published = Diagnosis(
-            kind, cause, _evidence_text(values), remedy, since_ns, position_valid=False, force_valid=False
+            kind,
+            cause,
+            _evidence_text(values),
+            remedy,
+            since_ns,
+            confidence=min(fault.confidence for fault in of_kind.values()),
+            position_valid=False,
+            force_valid=False,
         )
         diagnoses.append(PadDiagnosis(published, link, values, names))
     return diagnoses

@@ -38,6 +38,7 @@ from handtouch.supervisor.diagnose.static_load import StaticLoadDetector
 from handtouch.wire.faults import FaultKind
 
 BoolArray = NDArray[np.bool_]
+_MIN_CONFIDENCE_CHANGE = 0.3  # that is reported
 _MIN_CONTACT_COUNTS, _MAX_RELEASED_COUNTS = 250.0, 60.0
 _MIN_MOVE_FRACTION, _MAX_SMEAR_FRACTION = 0.08, 0.03  # of a side, roughly
 
@@ -207,4 +208,5 @@ def _is_sliding(excess: FloatArray, at: int, position: FloatArray, weights: Floa
 
 
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:
-    return before.electrodes != now.electrodes
+    change = abs(now.published.confidence - before.published.confidence)
+    return before.electrodes != now.electrodes or change > _MIN_CONFIDENCE_CHANGE
