@@ -85,7 +85,7 @@ def alarms(
 
 def test_false_alarms_are_as_rare_as_configured() -> None:
     rng, pads, steps, every_s = np.random.default_rng(1), 60, 300, 1.5
-    grip = GripModel(creep_std_m_per_s=1e-6)  # as this one does: none
+    grip = GripModel(creep_std_m_per_s=1e-6, chatter_m=0.0)  # as this one does: none
     force = np.full((steps, pads), FORCE_N)
     found = alarms(Contacts(pads, DT_S, every_s, grip), wandering(pads, steps, rng, grip), force, rng)
     expected = pads * steps * DT_S / every_s
@@ -127,7 +127,17 @@ def test_centroid_shift_by_pressing_harder_is_not_slip() -> None:
     assert alarms(Contacts(pads), moved, force, rng) == []
 
 
-@pytest.mark.parametrize(("speed_mm_per_s", "most_samples"), [(3.0, 30), (10.0, 6), (30.0, 3), (100.0, 2)])
+def test_chatter_that_returns_is_not_slip() -> None:
+    rng, pads, steps = np.random.default_rng(11), 12, 1600
+    place = wandering(pads, steps, rng, GripModel())
+    since_s = np.arange(steps)[:, None] * DT_S - 1.0 - rng.uniform(0.0, 1.4, pads)
+    burst = np.where((since_s > 0) & (since_s % 2.0 < 0.6), np.sin(2 * np.pi * 9 * (since_s % 2.0)), 0.0)
+    angle = rng.uniform(0, 2 * np.pi, pads)
+    place += 0.1e-3 * burst[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    assert alarms(Contacts(pads), place, np.full((steps, pads), FORCE_N), rng) == []
+
+
+@pytest.mark.parametrize(("speed_mm_per_s", "most_samples"), [(3.0, 36), (10.0, 9), (30.0, 3), (100.0, 2)])
 def test_slip_is_detected_within_a_few_samples(speed_mm_per_s: float, most_samples: int) -> None:
     rng, pads, onset, steps = np.random.default_rng(4), 20, 300, 360
     place = wandering(pads, steps, rng, GripModel())

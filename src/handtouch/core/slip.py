@@ -45,6 +45,12 @@ class GripModel:
     """standard deviation of the centroid's displacement per relative current of a firm contact"""
     coupling_drift_per_s: float = 0.05
     """relative change of that coupling in one second"""
+    chatter_m: float = 0.4e-3
+    """displacement that bursts of chatter don't reach, as it returns"""
+    chatter_speed_m_per_s: float = 8e-3
+    """speed that they don't reach"""
+    sway_m: float = 80e-6
+    """displacement that counts at higher speeds"""
 
     def parameters(self, period_s: float, samples_per_false_alarm: float) -> FloatArray:
         """Return the parameters of the stage, in the order of SLIP_PARAMETERS."""
@@ -63,6 +69,9 @@ class GripModel:
             "creep_time_constant_s": self.creep_time_constant_s,
             "coupling_variance": self.coupling_std_m**2,
             "coupling_drift_variance": (self.coupling_std_m * self.coupling_drift_per_s) ** 2,
+            "chatter_m": self.chatter_m,
+            "chatter_speed": self.chatter_speed_m_per_s,
+            "sway_m": self.sway_m,
         }
         return np.array([named[name] for name in SLIP_PARAMETERS])
 

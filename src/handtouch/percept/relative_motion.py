@@ -18,10 +18,8 @@ FloatArray = NDArray[np.float64]
 VELOCITY_WINDOW_S = 0.05
 """Time over which velocities of links are measured."""
 _LINK_VELOCITY_STD_M_PER_S = 1e-3  # from the elasticity of links
-_OBJECT_ROTATION_STD_RAD_PER_S, _OBJECT_VELOCITY_STD_M_PER_S = (
-    3.0,
-    0.3,
-)  # prior of an object's motion in the palm frame
+_OBJECT_ROTATION_STD_RAD_PER_S = 0.5  # prior of a held object's rotation in the palm frame
+_OBJECT_VELOCITY_STD_M_PER_S = 0.3
 _SLIDING_SPEED_STD_M_PER_S = 0.02  # prior of relative speeds while surfaces slide
 _SLIDING_LOG_ODDS = math.log(4.0)  # ln of the prior odds of sliding over rolling, of a moving centroid
 _SLIDING_AT_REST_LOG_ODDS = -9.0  # ln of the prior odds of sliding while the centroid rests

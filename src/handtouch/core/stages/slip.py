@@ -15,6 +15,9 @@ tremor that fits the model from sample to sample may not over a tenth of a secon
 against one of random speed, whose variance is learnt for every onset age from what ramps of that age met
 while the contact stuck, starting at a prior: gradient ascent on the likelihood.
 
+Chatter moves a contact as fast as a slow slip, and returns. Only onsets count since which the contact moved
+farther than chatter does, or farther than at its speed.
+
 Public names: `SlipStage`, `SLIP_SLICES`, `SLIP_COUNT`, `SLIP_PARAMETERS`, `MOTION_CLASSES`.
 """
 
@@ -28,17 +31,20 @@ SLIP_PARAMETERS = (
     "period_s", "log_threshold", "onset_stride", "log_creep_variance", "level_drift_variance",
     "log_tremor_variance", "min_log_tremor_variance", "max_log_tremor_variance", "tremor_rate",
     "tremor_time_constant_s", "creep_time_constant_s", "coupling_variance", "coupling_drift_variance",
+    "chatter_m", "chatter_speed", "sway_m",
 )  # fmt: skip
 """Names of the parameters, in order; `handtouch.core.slip.GripModel` explains them."""
 _PERIOD, _LOG_THRESHOLD, _STRIDE, _CREEP_START, _LEVEL_DRIFT, _TREMOR_START, _TREMOR_MIN = 0, 1, 2, 3, 4, 5, 6
 _TREMOR_MAX, _TREMOR_RATE, _TREMOR_TIME, _CREEP_TIME, _COUPLING, _COUPLING_DRIFT = 7, 8, 9, 10, 11, 12
+_CHATTER, _CHATTER_SPEED, _SWAY = 13, 14, 15
 
 _ONSETS, _RECENT, _OLDER_STRIDE = (
     33,
     12,
     4,
 )  # onset hypotheses; the latest of them; every fourth of older ones
-_RAMP, _SCORE, _INFORMATION = 6 * _ONSETS, 4 * _ONSETS, 5 * _ONSETS  # of an axis; after its four states
+_RAMP = 7 * _ONSETS  # of an axis: four states, and these
+_SCORE, _INFORMATION, _START = 4 * _ONSETS, 5 * _ONSETS, 6 * _ONSETS
 
 # a pad's row of the state
 _LABEL, _LOG_ODDS, _SLIPPING, _SLIPS, _SAMPLES, _AGE = 0, 1, 2, 3, 4, 5
@@ -52,7 +58,8 @@ _TREMOR, _GRIP_TREMOR, _LEVEL, _COVARIANCE, _AGES = 36, 38, 40, 48, 68
 _RAMPS = _AGES + _ONSETS
 _CREEP = _RAMPS + 2 * _RAMP
 _GRIP_CREEP = _CREEP + 2 * _ONSETS
-_COUNT = _GRIP_CREEP + 2 * _ONSETS
+_LAST = _GRIP_CREEP + 2 * _ONSETS
+_COUNT = _LAST + 2
 SLIP_COUNT = _COUNT
 SLIP_WORK = 7 * _ONSETS
 SLIP_SLICES = {
@@ -95,7 +102,7 @@ _START_VELOCITY_VARIANCE = 1e-4
 _ACCELERATION_DENSITY = 0.01 * 0.01  # of the centroid, spectral density [m^2/s^3]
 _FORCE_RATE_TIME_S = 0.02  # of smoothing
 _LIFT_OFF_HORIZON_S = 0.04  # lift-off if the force, at its present rate, vanishes within this time
-_SLIP_RATE_HZ = 0.05  # prior rate of slips of a contact
+_SLIP_RATE_HZ = 0.005  # prior rate of slips of a contact
 _UNLOADING_FACTOR = 5.0  # of that rate, while the force falls as fast as it has ever done
 _ODDS_DECAY_S = 0.05  # time constant in which outdated evidence of slip decays
 _MIN_REST_S = 0.06  # of a centroid, before it counts as sticking again
@@ -234,6 +241,7 @@ def _start_test(stage: SlipStage, row: int, kept: bool) -> None:
     if not kept:
         s[row + _PRESS_NOISE] = s[row + _LEARNING] = 0.0
     s[row + _FIRST_PRESS] = s[row + _LAST_PRESS] = s[row + _BEFORE_PRESS] = stage.press
+    s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
     s[row + _TESTED] = s[row + _UNTIL_ONSET] = s[row + _ONSET_NUMBER] = s[row + _ONSET_AGE] = 0.0
     s[row + _LOG_RATIO] = _NO_SLIP
 
@@ -281,6 +289,7 @@ def _test_slip(stage: SlipStage, row: int) -> None:
         _advance_ramps(stage, row, row + _RAMPS + axis * _RAMP)
         _learn_creep(stage, row, axis)
     _sum_ratios(stage, row)
+    s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
 
 
 def _set_transition(stage: SlipStage) -> None:
@@ -346,8 +355,10 @@ def _advance_onsets(stage: SlipStage, row: int) -> None:
         _shift_onsets(stage, row, _RECENT, _ONSETS)
     _shift_onsets(stage, row, 1, _RECENT)
     s[ages] = stage.dt_s  # it began with the previous sample
-    for k in range(12):
-        s[row + _RAMPS + k * _ONSETS] = 0.0
+    for axis in range(2):
+        for k in range(6):
+            s[row + _RAMPS + axis * _RAMP + k * _ONSETS] = 0.0
+        s[row + _RAMPS + axis * _RAMP + _START] = s[row + _LAST + axis]
 
 
 def _shift_onsets(stage: SlipStage, row: int, first: int, stop: int) -> None:
@@ -355,7 +366,7 @@ def _shift_onsets(stage: SlipStage, row: int, first: int, stop: int) -> None:
     s = stage.state
     for k in range(stop - first):
         s[row + _AGES + stop - 1 - k] = s[row + _AGES + stop - 2 - k]
-    for block in range(12):
+    for block in range(14):
         slots = row + _RAMPS + block * _ONSETS
         for k in range(stop - first):
             s[slots + stop - 1 - k] = s[slots + stop - 2 - k]
@@ -417,7 +428,7 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
             most = max(most, work[slow], work[medium], work[fast])
     total, best, largest = 0.0, 0, -1.0
     for k in range(_ONSETS):
-        if s[row + _AGES + k] > 0.0:
+        if s[row + _AGES + k] > 0.0 and _is_slip(stage, row, k):
             share = math.exp(work[4 * _ONSETS + k] - most)
             share += math.exp(work[5 * _ONSETS + k] - most)
             share += math.exp(work[6 * _ONSETS + k] - most)
@@ -431,6 +442,14 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
         for axis in range(2):
             ramps = row + _RAMPS + axis * _RAMP + best
             s[row + _SLIP_VELOCITY + axis] = s[ramps + _SCORE] / max(s[ramps + _INFORMATION], 1e-12)
+
+
+def _is_slip(stage: SlipStage, row: int, k: int) -> bool:
+    """Return whether the displacement since onset k is more than that of chatter, which returns."""
+    s, p = stage.state, stage.parameters
+    x, y = row + _RAMPS + _START + k, row + _RAMPS + _RAMP + _START + k
+    moved = math.sqrt((stage.x - s[x]) * (stage.x - s[x]) + (stage.y - s[y]) * (stage.y - s[y]))
+    return moved > min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * s[row + _AGES + k])
 
 
 def _log_ratio(work: memoryview[float], k: int, speed_variance: float) -> float:
