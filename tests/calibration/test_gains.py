@@ -212,6 +212,21 @@ def test_information_from_one_position_is_limited_by_the_model_error() -> None:
     assert estimator.estimate.status == GainStatus.UNDETERMINED
 
 
+def test_contacts_in_cells_of_their_own_are_worth_that_of_noise_and_model_error() -> None:
+    x, y = (at.ravel() for at in np.meshgrid(*[(np.arange(1, 9) + 0.5) / 10] * 2))
+    generator, ratios = np.random.default_rng(1), []
+    bound = fisher_covariance(SQUARE, x, y, np.hypot(1e-4, 1e-3))
+    for _ in range(10):
+        errors = np.hypot(1e-4, 1e-3) * generator.normal(size=(4, len(x)))
+        currents = (SQUARE.fractions(x, y) + errors) * np.exp(-TRUTH)[:, None]
+        estimator = GainEstimator(SQUARE, model_error=1e-3, drift_per_day=0, tolerance=0.3)
+        estimator.add_contacts(currents, 1e-4, 0)
+        estimator.process_pending()
+        ratios.append(np.trace(estimator.estimate.covariance) / np.trace(bound))
+    # one touch a cell doesn't tell an error of its position from one of its own: it counts as both
+    assert 0.9 < np.mean(ratios) < 2.6
+
+
 def test_position_dependent_model_errors_are_covered_by_the_covariance() -> None:
     """Fraction errors of 1e-3 are equal for all contacts in a cell and don't average out."""
     distances = []

@@ -337,7 +337,7 @@ class GainEstimator:
         kept = 1 / (1 + self._touch_variance * own)
         share = np.zeros(own.shape)
         for k, (i, j) in enumerate(at.T):
-            before = cells[i, j]
+            before = cells[i, j].copy()
             cells[i, j] += kept[k] * own[k]
             share[k] = kept[k] / ((1 + before * error) * (1 + cells[i, j] * error))
         return share, cells
