@@ -246,7 +246,10 @@ def page(found: dict[str, Any]) -> list[str]:
         ticks, contacts = (sum(row[name] for row in rows) for name in ("ticks", "contacts"))
         inside = np.average([row["inside"] for row in rows if row["compared"]],
                             weights=[row["compared"] for row in rows if row["compared"]])  # fmt: skip
-        by_day, replayed = memory_by_day(days["memory"]), [sum(part) for part in zip(*days["replays"])]
+        by_day, replayed = (
+            memory_by_day(days["memory"]),
+            [sum(part) for part in zip(*days["replays"], strict=True)],
+        )
 
         def row(name: str, values: Iterable[float]) -> str:
             return "| " + " | ".join([name, *(f"{value:.0f}" for value in values)]) + " |"
@@ -278,7 +281,7 @@ def page(found: dict[str, Any]) -> list[str]:
             + f"; rms errors of gains {100 * min(days['gain_errors']):.2f} to "
             f"{100 * max(days['gain_errors']):.2f} %. Replay of the last {len(days['replays'])} files: of "
             f"{replayed[0]} ticks, {replayed[2]} of {replayed[1]} messages are equal bit for bit. Diagnoses "
-            f"without a cause: {len(days['alarms'])} {sorted({kind for kind, *_ in days['alarms']}) or ''}; "
+            f"without a cause: {sorted({kind for kind, *_ in days['alarms']}) or 'none'}; "
             f"log messages without one: {len(days['unexplained'])}.", "",
             "![Memory, store, processor time of a tick and position error by hour](soak_days.png)", "",
         ]  # fmt: skip
