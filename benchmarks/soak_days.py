@@ -274,7 +274,7 @@ def page(found: dict[str, Any]) -> list[str]:
             row("objects of Python", (day.end[3] for day in by_day)),
             row("calibration store, kB", (day.end[4] / 1e3 for day in by_day)), "",
             "Memory is least after a restart, the same each day. With the first contacts after one, "
-            "supervision makes the tables of its diagnoses, some 10 MB for each of the hand's designs of pads "
+            "supervision makes the tables of its diagnoses, megabytes for each of the hand's designs of pads "
             "that is touched; the nights have no restart and no contact.", "",
             f"Positions of pads without a fault within their 95 % region: {inside:.1%}. Calibrations: "
             + ", ".join(f"{count} {state}" for state, count in Counter(days["states"]).items())

@@ -205,10 +205,10 @@ def _nodes(network: FractionModel) -> tuple[FloatArray, FloatArray]:
 
 
 class _FractionTable:
-    """Fractions (t, P, c) of t pads on the grid, and their slopes."""
+    """Fractions (t, P, c) of t pads on the grid, and their slopes: in single precision, as they are many."""
 
-    def __init__(self, fractions: FloatArray) -> None:
-        self._fractions = fractions
+    def __init__(self, exact: FloatArray) -> None:
+        self._fractions = fractions = exact.astype(np.float32)
         cube = fractions.reshape(-1, _NODES_PER_SIDE, _NODES_PER_SIDE, fractions.shape[2])
         self._slopes = np.stack([v.reshape(fractions.shape) for v in np.gradient(cube, axis=(1, 2))])
         self._coarse = (
