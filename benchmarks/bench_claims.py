@@ -337,8 +337,9 @@ def gain_figures(trials: int) -> Iterator[tuple[Claim, Figure]]:
     yield (
         Claim(
             "gains at the Fisher bound: error / bound after 400 contacts", "with the daemon's settings",
-            (1.2, math.inf), "ideal pads, point contacts, noise 1e-4; the check gave no figure: aim 1 to 1.2, "
-            "which the estimator reaches with `model_error` 0, as the bound assumes (see gains)",
+            (1.2, math.inf),
+            "ideal pads, point contacts, noise 1e-4; the check gave no figure: aim 1 to 1.2, "
+            "which the estimator reaches with `model_error` 0, as the bound assumes",
             as_share=False,
         ),
         Figure(value, value - reach, value + reach),
