@@ -76,23 +76,29 @@ def position_errors(runs: Sequence[Served], wide: bool | None = None) -> dict[st
 
 
 def covered(runs: Sequence[Served], wide: bool | None = None, stated: bool = True) -> dict[str, Any]:
-    """Return touches, the share within the reported 95 % region, and median reported std [mm].
+    """Return touches, the share within the reported 95 % region, also as the mean over the pads of all hands,
+    and median reported std [mm].
 
-    One sample of each touch, as samples of one touch share its errors. Without stated mounts the region is
-    flat, and errors count in its plane.
+    One sample of each touch, as samples of one touch share its errors; touches of one pad share its mount and
+    parts. Without stated mounts the region is flat, and errors count in its plane.
     """
     inside, size, dimensions = [], [], 3 if stated else 2
+    of_pads: dict[tuple[int, int], list[bool]] = {}
     for run in runs:
         rows = chosen(run, wide) & one_of_each_touch(run)
         values, axes = np.linalg.eigh(run.covariance_m2[rows])
         along = np.einsum("kji,kj->ki", axes, total(run)[rows])[:, -dimensions:]
         squared = (along**2 / np.maximum(values[:, -dimensions:], 1e-18)).sum(1)
         inside.append(squared < _WITHIN_95[dimensions])
+        for pad, within in zip(run.pad[rows].tolist(), inside[-1].tolist(), strict=True):
+            of_pads.setdefault((run.seed, pad), []).append(within)
         size.append(1e3 * np.sqrt(values.sum(1)))
     all_inside, sizes = np.concatenate(inside), np.concatenate(size)
     return {
         "touches": len(sizes),
         "within": str(Share.of_mask(all_inside)),
+        "pads": len(of_pads),
+        "mean_of_pads": 100 * float(np.mean([np.mean(own) for own in of_pads.values()])) if of_pads else None,
         "std_mm": float(np.median(sizes)) if len(sizes) else None,
     }
 
@@ -223,7 +229,8 @@ def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
 
     def region_row(name: str, of: dict[str, Any]) -> str:
         size = "" if of["std_mm"] is None else f"{of['std_mm']:.3f}"
-        return f"| {name} | {of['touches']} | {of['within']} | {size} |"
+        mean = "" if of["mean_of_pads"] is None else f"{of['mean_of_pads']:.1f}"
+        return f"| {name} | {of['touches']} | {of['within']} | {of['pads']} | {mean} | {size} |"
 
     objects = figures["objects"]
     position_rows = "\n".join(
@@ -278,10 +285,11 @@ centre of force. For a load along a line or on two points the currents give anot
 by the square of their distance: four currents can't resolve it.
 
 True positions within the 95 % region of the reported covariance, in % with 95 % intervals, and its size; one
-sample of each touch:
+sample of each touch. Touches of one pad share its mount and parts, and those of a pad on which an object
+chatters are many: *mean of pads* counts each pad of each hand once.
 
-| | touches | within | reported std, mm |
-| --- | --- | --- | --- |
+| | touches | within | pads | mean of pads | reported std, mm |
+| --- | --- | --- | --- | --- | --- |
 {region_rows}
 
 The deployment states `mount_std_mm = 0.2` and `mount_std_deg = 0.5`, and joint states carry the standard

@@ -8,7 +8,7 @@ in real time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -86,6 +86,8 @@ class Served:
     """Reported contacts by pad."""
     percepts: list[wire.Percept]
     """Published percepts, if requested."""
+    seed: int = 0
+    """Of the hand's parts and mounts."""
 
 
 def served(
@@ -122,7 +124,7 @@ def served(
         run.inputs.close()
         run.authenticator.close()
     railed = int((np.abs(counts) >= 32767).any(axis=2).sum())
-    return _compared(deployment, grasp, patches, run, railed)
+    return replace(_compared(deployment, grasp, patches, run, railed), seed=seed)
 
 
 class _Run:
