@@ -13,6 +13,7 @@ from handtouch import wire
 from handtouch.client.subscriber import columns
 from handtouch.config import ConfigError, parse
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.events import decode_calibration, encode_calibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField, Slab
@@ -175,3 +176,34 @@ def test_raw_counts_have_as_many_columns_as_the_pad_with_most_electrodes(
     (raw,) = sink.received
     expected = [[1, 2, 3, 4, 0, 0], [1, 2, 3, 4, 5, 6]] if len(arcs) == 6 else [[1, 2, 3, 4], [1, 2, 3, 0]]
     assert columns(raw)["counts"].tolist() == expected
+
+
+def test_a_loaded_state_continues_without_its_dead_electrode() -> None:
+    deployment = parse(arcs_text(SIX_ARCS))
+    network = PadModel(deployment).networks[1]
+    floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
+    counts = np.rint(8000 * floating.fractions(0.4 * network.a, 0.6 * network.b)).astype("<i2")
+
+    def pressed(pipeline: Pipeline, cycles: range) -> NDArray[np.float64]:
+        for cycle in cycles:
+            sync_ns = 10**9 + cycle * 5_000_000
+            pipeline.begin_cycle(sync_ns, sync_ns)
+            for number, part in enumerate((counts[:4], np.append(counts[4:], [0, 0]).astype("<i2"))):
+                pipeline.slab.write_pdo(1, part.tobytes(), sync_ns + 10, number)
+            pipeline.finish_cycle(sync_ns + 5_000_000, sync_ns + 5_000_000)
+        return np.array(pipeline.tick.columns.values[1])
+
+    def started() -> Pipeline:
+        made = Pipeline(PadModel(deployment), 5_000_000, 0.6, RawMessages())
+        made.node_state[:] = wire.PadState.CLEAR
+        made.slab.set_layout(1, tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(6)))
+        return made
+
+    first, second = started(), started()
+    first.set_calibration(1, replace(first.calibrations[1], dead_electrode=2))
+    values = pressed(first, range(5))
+    place = values[VALUE_SLICES["xy"]] / (network.a, network.b)
+    np.testing.assert_allclose(place, [0.4, 0.6], atol=2e-3)
+    recorded = [decode_calibration(encode_calibration(one)) for one in first.calibrations]
+    second.load_state(first.save_state(), first.state.layout(), recorded)
+    np.testing.assert_array_equal(pressed(second, range(5, 7)), pressed(first, range(5, 7)))

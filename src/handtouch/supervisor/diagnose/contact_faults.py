@@ -266,7 +266,9 @@ class ContactFaultDetector:
                 covariances[row, channel, channel] += _GAIN_STEP_STD**2
         cells = Counter(one.cell for one in memory)
         weights = np.array([(2 - 2.0 ** (1 - cells[one.cell])) / cells[one.cell] for one in memory])
-        return explain_contacts(scores, weights, covariances)
+        found = explain_contacts(scores, weights, covariances)
+        # what the model neglects is common to the scores of a contact: they count as one
+        return found._replace(nats=found.nats / scores.scores.shape[-1])
 
     def _score(self, index: int | None, memory: Sequence[_RememberedContact]) -> list[Scores]:
         """Return the scores of contacts under a hypothesis, each computed once."""
