@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from handtouch.config.shear import Shear
+from handtouch.field.elastic_layer import ElasticLayer
 from handtouch.field.shear import ShearPad, overlap_ratio
 from handtouch.simulate.shear_film import Plates, solve_film, solve_section
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
@@ -86,3 +87,25 @@ def test_an_ideal_layer_is_linear_and_a_real_one_has_loops_and_creeps() -> None:
     creeping = LayerHistory(shear("discs"), replace(IDEAL, creep=0.1))
     first, last = (float(creeping.advance(np.array([1.0, 0.0]), wait)[0]) for wait in (0.0, 60.0))
     assert last == pytest.approx(1.1 * first, rel=1e-4)
+
+
+def test_the_loop_of_the_layer_is_as_wide_as_its_stated_deviation() -> None:
+    """After other loads along one axis, far from the greatest one and near it."""
+    table, rng = shear("crossed bars"), np.random.default_rng(4)
+    hidden = replace(IDEAL, hysteresis=0.05)
+    first_n = np.array([2.0, 0.0])
+    stiffness = float(2.0 / LayerHistory(table, hidden).advance(first_n, 0.1)[0])
+    layer = ElasticLayer((stiffness, stiffness), 0.0, 0.0, 0.05, 0.0)
+    ratios: dict[bool, list[float]] = {False: [], True: []}
+    for _ in range(300):
+        history, loads = LayerHistory(table, hidden), rng.uniform(-3.0, 3.0, 4)
+        for load in loads:
+            history.advance(np.array([load, 0.0]), 0.1)
+        force_n = float(loads[-1] * rng.choice([1.0, rng.uniform()]))
+        moved = history.advance(np.array([force_n, 0.0]), 0.1)
+        peak_n = float(np.abs(loads).max())
+        found = layer.force(moved, 0.0, peak_n)
+        sigma = (found.vector_n[0] - force_n) / np.sqrt(found.covariance_n2[0, 0])
+        ratios[abs(force_n) > 0.7 * peak_n].append(float(sigma))
+    for sigmas in ratios.values():
+        assert 0.6 < np.sqrt(np.mean(np.square(sigmas))) < 1.2

@@ -48,6 +48,8 @@ class ElasticLayer:
     ) -> TangentialForce:
         """Return the force at a displacement (2, ...) from the tared position.
 
+        The loop is widest without force, and half as wide at its greatest force.
+
         covariance_m2: of it, (..., 2, 2). peak_n: greatest force since the tare (...), the width of the loop;
         default: the force itself, of a load that only grew.
         """
@@ -60,7 +62,8 @@ class ElasticLayer:
         covariance = np.outer(stiffness, stiffness) * np.asarray(covariance_m2, np.float64)
         covariance = covariance + self.stiffness_std**2 * rows[..., :, None] * rows[..., None, :]
         diagonal = (self.axis_std * rows) ** 2 + self.zero_std_n**2
-        diagonal = diagonal + (self.hysteresis * peak[..., None]) ** 2 / 3
+        loop = self.hysteresis * (peak - size / 2)
+        diagonal = diagonal + loop[..., None] ** 2 / 3
         return TangentialForce(force, covariance + diagonal[..., None] * np.eye(2))
 
 

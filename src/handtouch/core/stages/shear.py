@@ -248,7 +248,7 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
     kx, ky = numbers[_STIFFNESS], numbers[_STIFFNESS + 1]
     common = numbers[_STIFFNESS_STD] * numbers[_STIFFNESS_STD]
     axis_variance = numbers[_AXIS_STD] * numbers[_AXIS_STD]
-    loop = numbers[_HYSTERESIS] * stage.peak_n[pad]
+    loop = numbers[_HYSTERESIS] * (stage.peak_n[pad] - 0.5 * math.sqrt(fx * fx + fy * fy))
     even = numbers[_ZERO_STD] * numbers[_ZERO_STD] + loop * loop / 3.0
     xx = kx * kx * xx + (common + axis_variance) * fx * fx + even
     xy = kx * ky * xy + common * fx * fy
