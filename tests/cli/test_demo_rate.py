@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from handtouch.cli.demo_rate import sustained_period_ms
+from handtouch.cli.demo_rate import solving_time_s, sustained_period_ms
+from handtouch.config import parse
+from handtouch.core.pad_model import PadModel
+from tests.deployments import SIX_ARCS, arcs_text
 
 
 @pytest.mark.parametrize(
@@ -15,3 +18,7 @@ def test_period_is_doubled_until_a_quarter_of_it_suffices_within_the_range_of_de
     solving_s: float, period_ms: float
 ) -> None:
     assert sustained_period_ms(5.0, solving_s) == period_ms
+
+
+def test_contacts_on_pads_with_different_numbers_of_electrodes_are_timed() -> None:
+    assert solving_time_s(PadModel(parse(arcs_text(SIX_ARCS)))) > 0

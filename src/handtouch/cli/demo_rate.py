@@ -31,7 +31,7 @@ def lower_rate(deployment: Deployment, model: PadModel) -> Deployment:
     if compilation.compiled:
         return deployment
     configured_ms = deployment.daemon.sync_period_ms
-    period_ms = sustained_period_ms(configured_ms, _solving_time_s(model))
+    period_ms = sustained_period_ms(configured_ms, solving_time_s(model))
     if period_ms == configured_ms:
         return deployment
     print(
@@ -51,10 +51,12 @@ def sustained_period_ms(configured_ms: float, solving_s: float) -> float:
     return period_ms
 
 
-def _solving_time_s(model: PadModel) -> float:
+def solving_time_s(model: PadModel) -> float:
     """Return the median time of a tick's contacts, one on every pad."""
-    currents = np.stack([network.fractions(network.a / 3, network.b / 3) for network in model.networks])
-    currents = np.ascontiguousarray(currents * _CONTACT_RADII * model.begin_threshold_a[:, None])
+    currents = np.zeros((model.size, model.channels))
+    for row, network in zip(currents, model.networks, strict=True):
+        row[: len(network.series_ohm)] = network.fractions(network.a / 3, network.b / 3)
+    currents *= _CONTACT_RADII * model.begin_threshold_a[:, None]
     values = np.full((model.size, VALUE_COUNT), np.nan)
     requested = np.ones(model.size, dtype=np.bool_)
     solver = make_solver(model, currents, np.zeros(model.size), requested, values)
