@@ -1,6 +1,6 @@
 """SYNC rate of the demo where the core is uncompiled: as high as this machine holds with every pad touched.
 
-Public names: `lower_rate`, `sustained_period_ms`.
+Public names: `lower_rate`, `sustained_period_ms`, `solving_time_s`.
 """
 
 from __future__ import annotations
