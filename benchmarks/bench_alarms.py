@@ -1,8 +1,8 @@
 """Count false positives: hours of hands without faults in each world, mostly idle, now and then in use.
 
-Prints its tables and writes docs/benchmarks/alarms.md and alarms.json. `--hours N` in each world, instead of those for
-500 pad-hours in `default`. `--quick` plays one of each and writes nothing; `--journal FILE` keeps what was played: an interrupted run continues
-from it.
+Prints its tables and writes docs/benchmarks/alarms.md and alarms.json. `--hours N` in each world, instead
+of those for 500 pad-hours in `default`. `--quick` plays one of each and writes nothing; `--journal FILE`
+keeps what was played: an interrupted run continues from it.
 """
 
 from __future__ import annotations
