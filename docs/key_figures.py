@@ -157,8 +157,8 @@ def draw_methods(axes: Axes) -> None:
 
 
 def draw_slip(axes: Axes) -> None:
-    """Detection latency of slips by speed, with the bound of a test that knows the speed."""
-    rows = [row for row in load("slip")["latency"] if (row["sheet"], row["hz"]) == ("ideal", 200.0)]
+    """Detection latency of slips in the world `default` by speed, with the bound of a test that knows it."""
+    rows = [row for row in load("slip")["latency"] if (row["world"], row["hz"]) == ("default", 200.0)]
     for colour, force_n in ((BLUE, 0.5), (ORANGE, 2.0), (GREEN, 5.0)):
         of_force = sorted((row["mm_per_s"], row) for row in rows if row["force_n"] == force_n)
         found = [(speed, row["median_ms"]) for speed, row in of_force if row["median_ms"] is not None]
