@@ -71,7 +71,7 @@ def test_force_follows_the_contact_law_with_and_without_resistors(
     driver: Driver, pad: int, force_n: float
 ) -> None:
     model = driver.bench.model
-    current = model._threshold_current(np.full(3, force_n))[pad]
+    current = model.centre_current(pad, force_n)
     touch = {pad: driver.bench.counts(pad, 0.5, 0.5, current)}
     driver.step(touch)
     driver.step(touch)

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import helmert
 
 from handtouch.field.estimate import estimate
 from handtouch.field.model import FloatArray, ForwardModel, FractionModel, channel_noise
@@ -116,9 +115,12 @@ def score_slopes(
 
 
 def channel_count(model: FractionModel) -> int:
+    """Return the number of channels of a model."""
     return len(model.fractions(model.a / 2, model.b / 2))
 
 
 def gain_basis(channels: int) -> FloatArray:
     """Return orthonormal directions (c, c - 1) of log gains that sum to zero."""
+    from scipy.linalg import helmert  # not loaded with the package
+
     return np.asarray(helmert(channels).T)

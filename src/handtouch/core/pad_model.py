@@ -165,7 +165,7 @@ class PadModel:
             self._update_law_parameters(pad)
         self._centre_spreading = self._spreading_at_centre(networks)
         self.begin_threshold_a, self.end_threshold_a = (
-            np.array([self._threshold_current(pad, force[pad]) for pad in range(self.size)])
+            np.array([self.centre_current(pad, force[pad]) for pad in range(self.size)])
             for force in (self.begin_threshold_n, self.end_threshold_n)
         )
 
@@ -363,8 +363,8 @@ class PadModel:
         self._sheet_ohm[pad] = applied.ohm_per_square
         self._laws[pad] = contact_law(self._parts[pad][2], applied)
         self._update_law_parameters(pad)
-        self.begin_threshold_a[pad] = self._threshold_current(pad, self.begin_threshold_n[pad])
-        self.end_threshold_a[pad] = self._threshold_current(pad, self.end_threshold_n[pad])
+        self.begin_threshold_a[pad] = self.centre_current(pad, self.begin_threshold_n[pad])
+        self.end_threshold_a[pad] = self.centre_current(pad, self.end_threshold_n[pad])
 
     def _update_law_parameters(self, pad: int) -> None:
         """Write the law of a pad as the stages take it."""
@@ -419,7 +419,7 @@ class PadModel:
         )
         return radius * scale, self._series_resistance(pads, fractions)
 
-    def _threshold_current(self, pad: int, force_n: float) -> float:
+    def centre_current(self, pad: int, force_n: float) -> float:
         """Return the total current of a contact of that force at the centre of a pad."""
         spreading_m, series_ohm = (values[pad] for values in self._centre_spreading)
         drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]

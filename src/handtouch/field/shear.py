@@ -18,7 +18,6 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import ellipkm1, expit
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -35,6 +34,8 @@ def overlap_ratio(overlap: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
     overlap: in thicknesses of the film, negative apart. The conductance is that of 1 m of edge for a film of
     1 S/m: K(1 - m) / K(m) with m = 1 / (1 + exp(pi s)), exactly; s + 4 ln 2 / pi for a wide overlap.
     """
+    from scipy.special import ellipkm1, expit  # not loaded with the package
+
     s = np.asarray(overlap, np.float64)
     low = ellipkm1(expit(np.pi * s))
     return ellipkm1(expit(-np.pi * s)) / low, (np.pi / 2 / low) ** 2
