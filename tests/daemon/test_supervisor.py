@@ -11,7 +11,9 @@ import pytest
 
 from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
+from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import SerialChanged
+from handtouch.canbus.nodes.spec import NodeEvent
 from handtouch.config import Behaviour
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline
@@ -59,9 +61,13 @@ class Nodes:
 
     def __init__(self, serials: list[int | None]) -> None:
         self.serials = serials
+        self.states = [NodeState.OPERATIONAL] * len(serials)
 
     def status(self) -> list[Any]:
-        return [type("Status", (), {"serial": serial}) for serial in self.serials]
+        return [
+            type("Status", (), {"serial": serial, "state": state})
+            for serial, state in zip(self.serials, self.states, strict=True)
+        ]
 
 
 class LastMessages:
@@ -228,6 +234,15 @@ def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
         "calibration_state": "calibrated", "calibration_id": "21-1",
         "calibration_progress": "", "diagnoses": (),
     }  # fmt: skip
+
+
+def test_refused_node_replaces_none_whatever_happens_to_others(rig: Rig) -> None:
+    rig.nodes.serials[0], rig.nodes.states[0] = 21, NodeState.FAULTED
+    event = NodeEvent(1, rig.t_ns, NodeState.CONFIGURING, NodeState.OPERATIONAL, "")
+    rig.supervisor.handle_node_events([event], rig.t_ns)
+    rig.step()
+    assert not rig.pipeline.model.quarantined.any()
+    assert rig.supervisor.health_fields(0)["calibration_state"] == "default"
 
 
 def test_node_without_serial_number_counts_as_replaced(rig: Rig) -> None:

@@ -143,7 +143,9 @@ class SupervisorClient:
         ):
             return
         replaced = [event for event in events if isinstance(event, SerialChanged)]
-        known = [status.serial for status in self._master.status()]
+        known = [
+            None if status.state == NodeState.FAULTED else status.serial for status in self._master.status()
+        ]  # a node that was refused is none of the pad's
         for event in replaced:
             if self._serials[event.slot] is None:
                 self._serials[event.slot] = event.old_serial
