@@ -45,7 +45,7 @@ class GripModel:
     """standard deviation of the centroid's displacement per relative current of a firm contact"""
     coupling_drift_per_s: float = 0.05
     """relative change of that coupling in one second"""
-    chatter_m: float = 0.4e-3
+    chatter_m: float = 0.35e-3
     """displacement that bursts of chatter don't reach, as it returns"""
     chatter_speed_m_per_s: float = 8e-3
     """speed that they don't reach"""
