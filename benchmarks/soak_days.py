@@ -226,8 +226,10 @@ def plot(found: dict[str, Any], path: Path) -> None:
     hours = np.arange(len(days["by_hour"])) + 0.5
     for name, label in (("tick_p50_us", "median"), ("tick_p99_us", "99th percentile")):
         axes[1, 0].plot(hours, [row[name] for row in days["by_hour"]], ".-", label=label)
-    axes[1, 0].set(ylabel="processor time of a tick, us", xlabel="h", ylim=(0, None))
-    axes[1, 0].legend(frameon=False)
+    axes[1, 0].set(
+        ylabel="processor time of a tick, us", xlabel="h", ylim=(0, 1.25 * axes[1, 0].get_ylim()[1])
+    )
+    axes[1, 0].legend(frameon=False, loc="upper left", ncols=2)
     axes[1, 1].plot(hours, [row["rms_mm"] for row in days["by_hour"]], ".-")
     axes[1, 1].set(ylabel="rms position error, mm", xlabel="h", ylim=(0, None))
     for act in days["acts"]:
