@@ -13,6 +13,7 @@ import pytest
 from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.calibration.calibration import LawParameters
+from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master, SerialChanged
 from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
@@ -76,7 +77,9 @@ class Nodes:
         self.serials = [11, 12]
 
     def status(self) -> list[Any]:
-        return [type("Status", (), {"serial": serial}) for serial in self.serials]
+        return [
+            type("Status", (), {"serial": serial, "state": NodeState.OPERATIONAL}) for serial in self.serials
+        ]
 
 
 class FullRate:
