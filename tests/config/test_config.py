@@ -361,12 +361,13 @@ SHEAR_ERRORS = {
         (', "0x6401:8"', ""),
         'node = "eight_channel": has 7 channels, the pad 4 electrodes and its shear pad 4; list as many',
     ),
-    "curved pad": (
+    "folded pad": (
         (
-            'kind = "plane", length_mm = 16.0, width_mm',
-            'kind = "cylinder", radius_mm = 9, length_mm = 16.0, arc_deg',
+            'kind = "plane", length_mm = 16.0, width_mm = 16.0',
+            'kind = "prism", length_mm = 16.0, section_aside_mm = [-8, 0, 8], section_up_mm = [0, 2, 0]',
         ),
-        'shear = "bars": lies beneath a flat pad: it needs surface.kind = "plane", not "cylinder"',
+        'shear = "bars": lies beneath a smooth pad whose surface.kind is plane, cylinder, cone, sphere or '
+        'revolution, not "prism"',
     ),
     "electrode twice": (
         ('shear = "bars"', 'shear = "bars"\nshear_electrodes = ["x0", "xa", "y0", "y0"]'),

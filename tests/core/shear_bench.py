@@ -14,6 +14,7 @@ from handtouch.core.shear import ShearForces, shear_parameters
 from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.state import TickState
 from handtouch.field.shear import ShearPad
+from handtouch.hand import mount_transform
 from handtouch.wire import ForceStatus, PadState, PositionStatus
 from tests.deployments import deployment_text, pad_text
 
@@ -95,8 +96,18 @@ class ShearBench:
         assert theory.film is not None
         return theory.currents(whole, theory.film.conductance(normal_n)) * 32767 / 25e-3
 
-    def touch(self, pad: int, normal_n: float | None, centre_m: npt.ArrayLike, counts: npt.ArrayLike) -> None:
-        """Set a pad's contact, None for none, and write its sample of shear counts (4,)."""
+    def touch(
+        self,
+        pad: int,
+        normal_n: float | None,
+        centre_m: npt.ArrayLike,
+        counts: npt.ArrayLike,
+        tilt_rad: float = 0.0,
+    ) -> None:
+        """Set a pad's contact, None for none, and write its sample of shear counts (4,).
+
+        tilt_rad: of the surface there about the pad's y, as of a curved pad.
+        """
         state, touching = self.state, normal_n is not None
         state.touching[pad], state.contact_id[pad] = touching, pad + 1 if touching else 0
         values = state.values[pad]
@@ -104,6 +115,8 @@ class ShearBench:
         values[VALUE_SLICES["force_n"]] = normal_n if normal_n is not None else np.nan
         values[VALUE_SLICES["force_std_n"]] = FORCE_STD_N
         values[VALUE_SLICES["covariance_m2"]] = np.diag([CENTRE_STD_M**2, CENTRE_STD_M**2, 0.0]).ravel()
+        rotation, _ = mount_transform(self.deployment.pads[pad].pad)
+        values[VALUE_SLICES["normal"]] = rotation @ [np.sin(tilt_rad), 0.0, np.cos(tilt_rad)]
         words = np.concatenate([np.zeros(4), np.rint(counts)]).astype("<i2").tobytes()
         for pdo in range(2):
             self.slab.write_pdo(pad, words[8 * pdo : 8 * pdo + 8], 1, pdo)

@@ -52,6 +52,24 @@ def test_the_force_vector_is_that_of_the_theory(bench: ShearBench, pad: int) -> 
         )
 
 
+def test_on_a_curved_pad_the_tangential_force_lies_in_the_tangent_plane_of_the_contact(
+    bench: ShearBench,
+) -> None:
+    rotation, _ = mount_transform(bench.deployment.pads[0].pad)
+    forces = []
+    for tilt_rad in (0.0, 0.6):
+        counts = bench.counts(0, (0.15e-3, 0.1e-3), 3.0)
+        bench.touch(0, 3.0, (0.0, 0.0), counts, tilt_rad)
+        bench.tick()
+        forces.append(rotation.T @ bench.state.force_vector[0, :3])
+    cosine, sine = np.cos(0.6), np.sin(0.6)
+    turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    np.testing.assert_allclose(forces[1], turn @ forces[0], atol=1e-9)
+    covariance = rotation.T @ bench.state.force_vector[0, 3:].reshape(3, 3) @ rotation
+    normal = turn[:, 2]
+    assert normal @ covariance @ normal == pytest.approx(FORCE_STD_N**2)
+
+
 def test_the_hysteresis_bound_is_that_of_the_greatest_force_since_the_tare(bench: ShearBench) -> None:
     stds = []
     for moved in (0.05e-3, 0.4e-3, 0.05e-3):

@@ -30,7 +30,7 @@ from handtouch.field.outline_surface import OutlineSurface
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
-_FLAT_SURFACE = "plane"
+_SURFACES_ABOVE_SHEAR = ("plane", "cylinder", "cone", "sphere", "revolution")
 _MAX_OVERLAP_MM = 1e-6  # of arcs that end in one point: rounding
 
 
@@ -318,11 +318,13 @@ def _check_shear_pad(location: str, pad: Pad) -> Iterator[Problem]:
     """Check the surface above a shear pad, and the names of its electrodes."""
     if pad.shear is None:
         return
-    if pad.surface.kind != _FLAT_SURFACE:
+    if pad.surface.kind not in _SURFACES_ABOVE_SHEAR:
+        *others, last = _SURFACES_ABOVE_SHEAR
         yield Problem(
             f"{location}shear",
             _format_value(pad.shear),
-            f'lies beneath a flat pad: it needs surface.kind = "{_FLAT_SURFACE}", not "{pad.surface.kind}"',
+            f"lies beneath a smooth pad whose surface.kind is {', '.join(others)} or {last}, "
+            f'not "{pad.surface.kind}"',
         )
     if sorted(pad.shear_electrodes) != sorted(SIDE_ELECTRODES):
         once = f"must name each of {', '.join(SIDE_ELECTRODES)} once"

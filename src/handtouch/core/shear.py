@@ -23,7 +23,7 @@ from handtouch.field.shear import BarPattern, DiscPattern, ShearPattern, edge_ex
 from handtouch.hand import mount_transform
 
 FloatArray = NDArray[np.float64]
-_WORK = 46
+_WORK = 55
 _HIGH_LOAD = 1e12  # over the film's reference pressure
 
 
@@ -148,10 +148,10 @@ def _parameters(
         "axis_std": layer.axis_std,
         "hysteresis": layer.hysteresis,
         "zero_std_n": layer.zero_std_n,
-        "centre_m": (surface.a / 2, surface.b / 2),
+        "centre_m": np.array(surface.extent_m) / 2,
         "log_gain": [math.log(node.channel_scale[number]) for number in shear_numbers(pad)],
         "tilt_per_m": film.tilt_slopes(_HIGH_LOAD * film.plate_m2, pattern.centroids_m).ravel(),
-        "rotation": rotation.ravel(),
+        "along": rotation[:, 0],
         **_geometry(pattern),
     }
     for name, value in values.items():

@@ -226,6 +226,7 @@ class VirtualHand:
         row, applied = self.virtual_pads[contact.row], contact.contact
         shape = row.shape
         s_m, phi = applied.x * shape.length_m, applied.y * shape.arc
+        normal = shape.normal(s_m, phi)
         in_counts = jacobian * self._gains[contact.row][:, None]
         in_counts[:, :2] @= np.linalg.inv(shape.metres_per_fraction(applied.x, applied.y))
         variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
@@ -237,20 +238,23 @@ class VirtualHand:
             applied.touch_number,
             *shape.arc_lengths(s_m, phi),
             _vector(row.rotation @ shape.point(s_m, phi) + row.translation),
-            _vector(row.rotation @ shape.normal(s_m, phi)),
+            _vector(row.rotation @ normal),
             applied.force_n,
             contact.patch.radius_m,
             tuple(currents[: len(row.limits)].tolist()),
             math.sqrt(covariance[0, 0] + covariance[1, 1]),
-            self._true_force_vector(row, applied.force_n, t_s),
+            self._true_force_vector(row, normal, applied.force_n, t_s),
         )
 
     @staticmethod
-    def _true_force_vector(pad: VirtualPad, force_n: float, t_s: float) -> Vector | None:
+    def _true_force_vector(pad: VirtualPad, normal: FloatArray, force_n: float, t_s: float) -> Vector | None:
         """Return the force on a pad in its link's frame, where a shear pad senses it."""
         if pad.shear is None:
             return None
-        return _vector(pad.rotation @ [*pad.shear.tangential_n(np.array([t_s]))[:, 0], -force_n])
+        across = np.cross(normal, [1.0, 0.0, 0.0])
+        across /= np.linalg.norm(across)
+        x_n, y_n = pad.shear.tangential_n(np.array([t_s]))[:, 0]
+        return _vector(pad.rotation @ (x_n * np.cross(across, normal) + y_n * across - force_n * normal))
 
 
 def _applied_patch(contact: AppliedContact, patch: ContactPatch) -> ContactPatch:

@@ -43,7 +43,8 @@ class VirtualShear:
         self._shear, self._hidden = deployment.shears[pad.shear], world.shear(name)
         self._touches, self._repeat_period_s = touches, repeat_period_s
         self._electrodes = SimulatedShearPad(self._shear, node.drive_v, self._hidden)
-        self._size_m = 1e-3 * np.array([pad.surface.length_mm, pad.surface.width_mm])
+        shape = world.surface(hand, pad)
+        self._size_m = np.diag(shape.metres_per_fraction(0.5, 0.5))
         channels, numbers = resolve_channels(node.channels, node.eds), list(shear_numbers(pad))
         self._limits = np.array([channels[number].limits for number in numbers])
         full = np.array([node.full_scale_counts or high for high in self._limits[:, 1]])

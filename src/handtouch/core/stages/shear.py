@@ -19,7 +19,7 @@ SHEAR_CHANNELS = _CHANNELS
 """Electrodes of a shear pad: x0, xa, y0, yb."""
 _FILM, _OVERLAP, _LOST, _RADIUS, _INSET, _TRAVEL, _NOISE, _LOAD = 0, 1, 2, 3, 4, 5, 6, 7
 _STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE = 8, 10, 11, 12, 13, 14
-_LOG_GAIN, _TILT, _ROTATION, _NUMBERS = 16, 20, 28, 37
+_LOG_GAIN, _TILT, _ALONG, _NUMBERS = 16, 20, 28, 31
 SHEAR_NUMBERS = {
     "film_m": slice(_FILM, _FILM + 1),
     "overlap_m": slice(_OVERLAP, _OVERLAP + 1),  # of bars at rest
@@ -37,11 +37,12 @@ SHEAR_NUMBERS = {
     "centre_m": slice(_CENTRE, _CENTRE + 2),  # of the plate, as arc lengths on the pad
     "log_gain": slice(_LOG_GAIN, _LOG_GAIN + 4),  # of channels: current per count
     "tilt_per_m": slice(_TILT, _TILT + 8),  # d ln(conductance) / d(centre) of channels at a high load
-    "rotation": slice(_ROTATION, _ROTATION + 9),  # from the pad's frame to the link's
+    "along": slice(_ALONG, _ALONG + 3),  # the pad's x in the link's frame
 }
 """Layout of the numbers of a `ShearTable`."""
 _VALUES, _PAD_M, _FORCE = VALUE_COUNT, VALUE_SLICES["pad_m"].start, VALUE_SLICES["force_n"].start
 _FORCE_STD, _COVARIANCE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["covariance_m2"].start
+_NORMAL = VALUE_SLICES["normal"].start
 _VECTOR = 12  # force and its covariance
 _CLEAR = 0  # PadState
 _NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID = 0, 1, 2, 3, 4  # ForceStatus
@@ -75,7 +76,7 @@ class ShearTable:
 class ShearStage:
     """Shear pads of a model. arrays: flat memory of the arrays of `TickState` by their names.
 
-    position_status, force_status: (n,) of the pads' contacts. work: (48,), working memory.
+    position_status, force_status: (n,) of the pads' contacts. work: (55,), working memory.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class ShearStage:
         self.vector, self.status = arrays["force_vector"], arrays["force_vector_status"]
         self.counts, self.logs, self.off = work[0:4], work[4:8], work[8:12]
         self.log_area, self.slope, self.gain = work[12:16], work[16:28], work[28:40]
-        self.motion, self.way = work[40:43], work[43:46]
+        self.motion, self.way, self.axes = work[40:43], work[43:46], work[46:55]
         self.misfit = 0.0
 
     def update_forces(self, memory: SampleMemory) -> None:
@@ -255,18 +256,32 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
     yy = ky * ky * yy + (common + axis_variance) * fy * fy + even
     std = stage.values[row + _FORCE_STD]
     zz = std * std
+    _set_axes(stage, table)
+    axes = stage.axes
     for i in range(3):
-        a, b, c = (
-            numbers[_ROTATION + 3 * i],
-            numbers[_ROTATION + 3 * i + 1],
-            numbers[_ROTATION + 3 * i + 2],
-        )
+        a, b, c = axes[3 * i], axes[3 * i + 1], axes[3 * i + 2]
         stage.vector[first + i] = a * fx + b * fy - c * normal_n
         for j in range(3):
-            at = _ROTATION + 3 * j
-            known = (a * xx + b * xy) * numbers[at] + (a * xy + b * yy) * numbers[at + 1]
-            value = known + c * zz * numbers[at + 2]
+            known = (a * xx + b * xy) * axes[3 * j] + (a * xy + b * yy) * axes[3 * j + 1]
+            value = known + c * zz * axes[3 * j + 2]
             stage.vector[first + 3 + 3 * i + j] = value if zz < _INFINITY else _NAN
+
+
+def _set_axes(stage: ShearStage, table: ShearTable) -> None:
+    """Set the axes of the surface at the contact, in the link's frame: x along the pad's, y, and the normal.
+
+    The columns of a matrix, so that it turns forces in the tangent plane to the link's frame.
+    """
+    axes, numbers, at = stage.axes, table.numbers, table.pad * _VALUES + _NORMAL
+    nx, ny, nz = stage.values[at], stage.values[at + 1], stage.values[at + 2]
+    ax, ay, az = numbers[_ALONG], numbers[_ALONG + 1], numbers[_ALONG + 2]
+    part = ax * nx + ay * ny + az * nz
+    ax, ay, az = ax - part * nx, ay - part * ny, az - part * nz
+    length = math.sqrt(ax * ax + ay * ay + az * az)
+    ax, ay, az = ax / length, ay / length, az / length
+    axes[0], axes[3], axes[6] = ax, ay, az
+    axes[1], axes[4], axes[7] = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
+    axes[2], axes[5], axes[8] = nx, ny, nz
 
 
 def _load_share(numbers: memoryview[float], normal_n: float) -> float:
