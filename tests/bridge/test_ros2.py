@@ -128,13 +128,20 @@ def test_every_field_of_a_contact_is_decoded_by_ros(store: Any) -> None:
 
 
 def test_a_wrench_is_the_force_on_the_link_about_its_origin(store: Any) -> None:
-    encoded = encode_wrench(LOCATED, make_stamper())
+    encoded = encode_wrench(replace(LOCATED, force_vector_status="unreliable"), make_stamper())
     assert encoded is not None
     decoded = store.deserialize_cdr(encoded, "geometry_msgs/msg/WrenchStamped")
     force, torque = decoded.wrench.force, decoded.wrench.torque
     assert [force.x, force.y, force.z] == pytest.approx([0.0, -1.5, -2.0])
     expected = np.cross(LOCATED.position_m or (), [0.0, -1.5, -2.0])
     assert [torque.x, torque.y, torque.z] == pytest.approx(expected.tolist())
+
+
+def test_a_wrench_above_a_shear_pad_has_the_valid_force_vector() -> None:
+    encoded = encode_wrench(LOCATED, make_stamper())
+    assert encoded is not None
+    force = ros.WrenchStamped.deserialize(encoded).wrench.force
+    assert [force.x, force.y, force.z] == pytest.approx(LOCATED.force_vector_n)
 
 
 def test_wrenches_are_zero_at_the_end_and_absent_where_unknown() -> None:
@@ -145,7 +152,8 @@ def test_wrenches_are_zero_at_the_end_and_absent_where_unknown() -> None:
     assert encode_wrench(replace(LOCATED, force_n=None), stamper) is None
     unknown = make_contact("thumb_tip", "update", 8)
     assert encode_palm_wrench([LOCATED, unknown], 1, "palm", stamper) is None
-    total = encode_palm_wrench([LOCATED, LOCATED], 1, "palm", stamper)
+    flat = replace(LOCATED, force_vector_status="not_computed")
+    total = encode_palm_wrench([flat, flat], 1, "palm", stamper)
     assert total is not None
     wrench = ros.WrenchStamped.deserialize(total).wrench
     assert wrench.force.z == -5.0

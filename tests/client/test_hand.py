@@ -190,6 +190,45 @@ def test_the_covariance_of_a_wrench_is_that_of_perturbed_forces_and_positions() 
     assert (np.cov(drawn.T) - wrench.covariance) / scale == pytest.approx(np.zeros((6, 6)), abs=0.02)
 
 
+def test_a_wrench_above_a_shear_pad_has_the_whole_force_and_its_covariance_in_every_frame() -> None:
+    rng = np.random.default_rng(5)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    normal, position_m = np.array([0.0, 0.6, 0.8]), np.array([0.02, -0.01, 0.03])
+    vector_n, root = np.array([0.5, 0.3, -2.0]), rng.normal(scale=0.1, size=(3, 3))
+    covariance_n2 = root @ root.T
+    valid, unreliable = wire.ForceStatus.VALID, wire.ForceStatus.UNRELIABLE
+    arrays = HandArrays(
+        make_frame(
+            state=(TOUCHED,) * 3,
+            force_n=(1.0, 1.0, 1.0),
+            force_std_n=(0.1, 0.1, 0.1),
+            force_status=(valid,) * 3,
+            force_vector_status=(valid, unreliable, valid),
+            position_status=(wire.PositionStatus.VALID,) * 3,
+            palm_status=(wire.FrameStatus.VALID,) * 3,
+            position_m=np.tile(position_m, (3, 1)),
+            normal=np.tile(normal, (3, 1)),
+            covariance_m2=np.zeros((3, 9)),
+            force_vector_n=np.tile(vector_n, (3, 1)),
+            force_vector_covariance_n2=np.tile(covariance_n2.ravel(), (3, 1)),
+            palm_position_m=np.tile(turn @ position_m, (3, 1)),
+            palm_normal=np.tile(turn @ normal, (3, 1)),
+            palm_covariance_m2=np.zeros((3, 9)),
+            palm_force_vector_n=np.tile(turn @ vector_n, (3, 1)),
+        )
+    )
+    both = np.kron(np.eye(2), turn)
+    first, second, _ = (arrays.wrenches("link")[link] for link in arrays.links)
+    assert first.force_n == pytest.approx(vector_n)
+    assert first.moment_nm == pytest.approx(np.cross(position_m, vector_n))
+    assert first.covariance[:3, :3] == pytest.approx(covariance_n2)
+    assert second.force_n == pytest.approx(-normal, abs=1e-6)
+    palm = arrays.wrenches("palm")[arrays.links[0]]
+    assert palm.force_n == pytest.approx(turn @ vector_n, abs=1e-6)
+    assert palm.covariance == pytest.approx(both @ first.covariance @ both.T, abs=1e-7)
+
+
 def test_a_finger_s_wrench_is_the_sum_of_its_contacts_and_names_those_it_lacks() -> None:
     arrays = _touched_arrays()
     each = arrays.wrenches("palm")

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.client.wrench import GraspMatrix, Wrench, contact_wrenches, grasp_matrix, sum_wrenches
+from handtouch.client.wrench import (
+    GraspMatrix,
+    Wrench,
+    contact_wrenches,
+    grasp_matrix,
+    sum_wrenches,
+    turn_covariance,
+)
 
 T = TypeVar("T")
 FrameName = Literal["link", "palm", "base"]
@@ -157,11 +164,13 @@ class HandArrays(LinkColumns):
     def wrenches(self, frame: FrameName = "palm", links: str = "*") -> dict[str, Wrench]:
         """Return the wrench of each contact on links that match a pattern, about the origin of the frame.
 
-        Contacts without a valid force, or a valid position in that frame, are left out. Raises LookupError
-        while no scene requests the frame.
+        Contacts without a valid force, or a valid position in that frame, are left out. A valid force vector
+        counts in place of the normal force. Raises LookupError while no scene requests the frame.
         """
         rows = self._rows_of(links) & self._usable(frame)
-        made = contact_wrenches(*self._geometry(frame, rows), *self._forces(rows))
+        made = contact_wrenches(
+            *self._geometry(frame, rows), *self._forces(rows), *self._force_vectors(frame, rows)
+        )
         return dict(zip(self._names(rows), made, strict=True))
 
     def wrench(self, links: str = "*", frame: FrameName = "palm") -> Wrench:
@@ -226,6 +235,22 @@ class HandArrays(LinkColumns):
     def _forces(self, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
         force_n, std_n = (c.array[rows].astype(np.float64) for c in (self.force_n, self.force_std_n))
         return force_n, std_n
+
+    def _force_vectors(self, frame: FrameName, rows: NDArray[np.bool_]) -> tuple[FloatArray, ...]:
+        """Return force vectors and covariances in a frame, NaN where none is valid; () without shear pads."""
+        prefix = "" if frame == "link" else f"{frame}_"
+        if not (self.frame.force_vector_status and getattr(self.frame, f"{prefix}force_vector_n")):
+            return ()
+        valid = self.force_vector_status.array[rows] == wire.ForceStatus.VALID
+        names = ("force_vector_n", "normal", "force_vector_covariance_n2")
+        vector_n, normal, flat = (self.column(name).array[rows].astype(np.float64) for name in names)
+        vector_n[~valid] = np.nan
+        covariance_n2 = flat.reshape(-1, 3, 3)
+        if frame == "link":
+            return vector_n, covariance_n2
+        turned_n, turned = (self.column(prefix + name).array[rows].astype(np.float64) for name in names[:2])
+        turned_n[~valid] = np.nan
+        return turned_n, turn_covariance(covariance_n2, normal, vector_n, (turned, turned_n))
 
     def _rows_of(self, pattern: str) -> NDArray[np.bool_]:
         rows = np.array([fnmatchcase(link, pattern) for link in self.links], np.bool_)

@@ -1,7 +1,7 @@
-"""Wrenches of contacts and the grasp matrix, from positions, normals and normal forces.
+"""Wrenches of contacts and the grasp matrix, from positions, normals and forces.
 
-A pad measures the normal force only: friction isn't part of any wrench. Public names: `Wrench`,
-`GraspMatrix`, `contact_wrenches`, `sum_wrenches`, `grasp_matrix`.
+A touch pad measures the normal force only: friction is part of the wrenches of contacts above shear pads.
+Public names: `Wrench`, `GraspMatrix`, `contact_wrenches`, `sum_wrenches`, `grasp_matrix`, `turn_covariance`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+_MIN_TANGENTIAL_N = 1e-6
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Wrench:
     """Force and moment that contacts exert on the hand, about the origin of a frame."""
 
     force_n: FloatArray
-    """(3,) [N], against the outward normal of a pad"""
+    """(3,) [N], against the outward normal of a pad, with the tangential force above a shear pad"""
     moment_nm: FloatArray
     """(3,) [N m], about the frame's origin"""
     covariance: FloatArray
@@ -48,17 +49,26 @@ def contact_wrenches(
     covariance_m2: FloatArray,
     force_n: FloatArray,
     force_std_n: FloatArray,
+    vector_n: FloatArray | None = None,
+    vector_covariance_n2: FloatArray | None = None,
 ) -> list[Wrench]:
     """Return the wrenches of n contacts.
 
-    position_m, normal: (n, 3). covariance_m2: (n, 3, 3) of the positions. force_n, force_std_n: (n,). First
-    order; the normal counts as exact.
+    position_m, normal: (n, 3). covariance_m2: (n, 3, 3) of the positions. force_n, force_std_n: (n,).
+    vector_n: (n, 3), vector_covariance_n2: (n, 3, 3), force vectors above shear pads, in place of the normal
+    forces; NaN where they aren't known. First order; the normal counts as exact.
     """
-    force = -normal * force_n[:, None]
+    force: FloatArray = -normal * force_n[:, None]
+    spread: FloatArray = force_std_n[:, None, None] ** 2 * normal[:, :, None] * normal[:, None, :]
+    if vector_n is not None and vector_covariance_n2 is not None:
+        known = np.isfinite(np.concatenate([vector_n, vector_covariance_n2.reshape(-1, 9)], axis=1)).all(
+            axis=1
+        )
+        force[known], spread[known] = vector_n[known], vector_covariance_n2[known]
     moment = np.cross(position_m, force)
     # d moment = position x d force - force x d position
-    unit = np.concatenate([-normal, np.cross(position_m, -normal)], axis=1)  # (n, 6) per newton
-    covariance = force_std_n[:, None, None] ** 2 * unit[:, :, None] * unit[:, None, :]
+    by_force = np.concatenate([np.tile(np.eye(3), (len(force), 1, 1)), cross_matrix(position_m)], axis=1)
+    covariance = by_force @ spread @ by_force.transpose(0, 2, 1)
     lever = cross_matrix(force)
     covariance[:, 3:, 3:] += lever @ covariance_m2 @ lever.transpose(0, 2, 1)
     return [
@@ -90,6 +100,28 @@ def grasp_matrix(position_m: FloatArray, normal: FloatArray) -> FloatArray:
     basis = np.stack([normal, first, np.cross(normal, first)], axis=1)  # (n, 3 directions, 3)
     moments = np.cross(position_m[:, None, :], basis)
     return np.asarray(np.concatenate([basis, moments], axis=2).reshape(-1, 6).T)
+
+
+def turn_covariance(
+    covariance_n2: FloatArray, normal: FloatArray, vector_n: FloatArray, to: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Return covariances (n, 3, 3) of force vectors in another frame, in which normal and vector are `to`.
+
+    normal, vector_n: (n, 3) in their own frame; they determine the rotation. Where the force has no
+    tangential part, its direction in the tangent plane is arbitrary.
+    """
+    turn = _axes(*to) @ _axes(normal, vector_n).transpose(0, 2, 1)
+    return np.asarray(turn @ covariance_n2 @ turn.transpose(0, 2, 1))
+
+
+def _axes(normal: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return rotations (n, 3, 3) whose columns are the normal, the vector's tangent and the third axis."""
+    tangent = vector - normal * (normal * vector).sum(axis=1, keepdims=True)
+    size = np.linalg.norm(tangent, axis=1, keepdims=True)
+    other = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
+    tangent = np.where(size > _MIN_TANGENTIAL_N, tangent, other)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return np.stack([normal, tangent, np.cross(normal, tangent)], axis=2)
 
 
 def cross_matrix(vectors: FloatArray) -> FloatArray:

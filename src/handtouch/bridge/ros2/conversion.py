@@ -132,7 +132,8 @@ def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes | None:
         return encode_zero_wrench(contact.t_ns, contact.frame, stamper)
     if contact.force_n is None or contact.position_m is None or contact.normal is None:
         return None
-    wrench = _wrench(contact.position_m, contact.normal, contact.force_n)
+    whole = contact.force_vector_n if contact.force_vector_status == "valid" else None
+    wrench = _wrench(contact.position_m, contact.normal, contact.force_n, whole)
     return _encode_wrench(contact.t_ns, contact.frame, wrench, stamper)
 
 
@@ -145,7 +146,8 @@ def encode_palm_wrench(
     for contact in contacts:
         if contact.force_n is None or contact.palm_position_m is None or contact.palm_normal is None:
             return None
-        wrenches.append(_wrench(contact.palm_position_m, contact.palm_normal, contact.force_n))
+        whole = contact.palm_force_vector_n if contact.force_vector_status == "valid" else None
+        wrenches.append(_wrench(contact.palm_position_m, contact.palm_normal, contact.force_n, whole))
     return _encode_wrench(t_ns, palm_link, [sum(values) for values in zip(*wrenches, strict=True)], stamper)
 
 
@@ -247,9 +249,15 @@ def _status(
     return ros.DiagnosticStatus(level, name, message, hardware_id, pairs)
 
 
-def _wrench(position: Sequence[float], normal: Sequence[float], force_n: float) -> tuple[float, ...]:
-    """Return force and torque of a force against the outward normal."""
-    (x, y, z), (force_x, force_y, force_z) = position, [-force_n * component for component in normal]
+def _wrench(
+    position: Sequence[float],
+    normal: Sequence[float],
+    force_n: float,
+    vector_n: Sequence[float] | None,
+) -> tuple[float, ...]:
+    """Return force and torque of a force vector, or without one of a force against the outward normal."""
+    x, y, z = position
+    force_x, force_y, force_z = vector_n or [-force_n * component for component in normal]
     torque = y * force_z - z * force_y, z * force_x - x * force_z, x * force_y - y * force_x
     return force_x, force_y, force_z, *torque
 
