@@ -108,26 +108,37 @@ def onsets(speed: FloatArray) -> list[int]:
     return found
 
 
-def slips(run: Served, labels: Sequence[str] = ALARMS) -> dict[str, Any]:
+def slips(
+    run: Served,
+    labels: Sequence[str] = ALARMS,
+    kinds: Sequence[str] = ("motion",),
+    lead_s: float = _MAX_LEAD_S,
+    on: Sequence[str] | None = None,
+) -> dict[str, Any]:
     """Return delays [s] of alarms after onsets (inf: none), of the detector and of the rate of force.
 
-    Also the seconds of firm grip, and the alarms in them.
+    Also the seconds of firm grip, and the alarms in them. An alarm has one of `labels` in a percept of one of
+    `kinds`, and is of an onset from `lead_s` before it on. on: links that count, by default all.
     """
     speed, links = speeds(run.grasp), [pad.link for pad in run.grasp.pads]
     alarms: list[list[float]] = [[] for _ in links]
-    label = [""] * len(links)
+    alarmed: list[set[str]] = [set() for _ in links]
     for percept in run.percepts:
-        if percept.kind != "motion":
+        if percept.kind not in kinds:
             continue
         row = links.index(percept.link)
-        moves = percept.label in labels
-        if moves and label[row] != "moves":
+        if percept.label not in labels:
+            alarmed[row].discard(percept.kind)
+            continue
+        if not alarmed[row]:
             alarms[row].append((percept.t_ns - _START_NS) * 1e-9)
-        label[row] = "moves" if moves else percept.label
+        alarmed[row].add(percept.kind)
     by_rate = [_rates(run, row) for row in range(len(links))]
     found: dict[str, Any] = {"delays": [], "firm_s": 0.0, "false": 0, "rolls": 0, "between": 0, "late": 0}
     found |= {"rate_delays": [[] for _ in RATES_HZ], "rate_false": [0] * len(RATES_HZ), "short": 0}
     for row, pad in enumerate(run.grasp.pads):
+        if on is not None and pad.link not in on:
+            continue
         in_contact = np.zeros(len(speed), np.bool_)
         for begin, end in run.spans[row]:
             in_contact[round(begin / TIME_STEP_S) : round(end / TIME_STEP_S)] = True
@@ -149,7 +160,7 @@ def slips(run: Served, labels: Sequence[str] = ALARMS) -> dict[str, Any]:
             if until - onset * TIME_STEP_S < 0.02:
                 found["short"] += 1
                 continue
-            found["delays"].append(_delay(onset * TIME_STEP_S, until, alarms[row]))
+            found["delays"].append(_delay(onset * TIME_STEP_S, until, alarms[row], lead_s))
             for number, rate in enumerate(RATES_HZ.tolist()):
                 found["rate_delays"][number].append(
                     _delay(onset * TIME_STEP_S, until, _crossings(by_rate[row], rate))
@@ -175,12 +186,12 @@ def _crossings(series: tuple[FloatArray, FloatArray], rate: float) -> list[float
     return list(times_s[first].tolist())
 
 
-def _delay(onset_s: float, until_s: float, alarms: Sequence[float]) -> float:
+def _delay(onset_s: float, until_s: float, alarms: Sequence[float], lead_s: float = _MAX_LEAD_S) -> float:
     return min(
         (
             alarm_s - onset_s
             for alarm_s in alarms
-            if onset_s - _MAX_LEAD_S <= alarm_s <= min(until_s, onset_s + _MAX_DELAY_S)
+            if onset_s - lead_s <= alarm_s <= min(until_s, onset_s + _MAX_DELAY_S)
         ),
         default=np.inf,
     )
@@ -298,8 +309,8 @@ def collect(runs: Sequence[Served]) -> dict[str, Any]:
     figures: dict[str, Any] = {"slip": {}, "stiffness": {}, "shape": [shaped(run) for run in runs]}
     for name in [*names, "**all**"]:
         some = [of for object_name, of in by_run if name in (object_name, "**all**")]
-        figures["slip"][name] = _together(some)
-    figures["slip"]["all, `sliding` alone"] = _together([slips(run, ALARMS[1:]) for run in runs])
+        figures["slip"][name] = together(some)
+    figures["slip"]["all, `sliding` alone"] = together([slips(run, ALARMS[1:]) for run in runs])
     figures["rate"] = _of_rate([of for _, of in by_run], figures["slip"]["**all**"])
     minutes = figures["slip"]["**all**"]["minutes"]
     figures["rates"] = [
@@ -312,7 +323,7 @@ def collect(runs: Sequence[Served]) -> dict[str, Any]:
     return figures
 
 
-def _together(some: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def together(some: Sequence[dict[str, Any]]) -> dict[str, Any]:
     delays = np.array([delay for of in some for delay in of["delays"]])
     minutes = sum(of["firm_s"] for of in some) / 60
     false = sum(of["false"] for of in some)
@@ -508,7 +519,7 @@ def main() -> None:
     figures = {"mujoco": mujoco.__version__} | collect(runs)
     for world in ("ideal", "harsh"):
         others = [served(deployment, name, 1, drawn_world(world, 1), perceive=True) for name in args.objects]
-        figures["slip"][f"seed 1, world `{world}`"] = _together([slips(run, ALARMS) for run in others])
+        figures["slip"][f"seed 1, world `{world}`"] = together([slips(run, ALARMS) for run in others])
         progress(f"world {world}")
     print(write(figures, args.seeds, output_folder(args.quick)))
 

@@ -1,148 +1,100 @@
-"""Measure incipient slip from friction ratios of shear pads in MuJoCo's grasps: delay and false alarms.
+"""Measure fingertips with shear pads in MuJoCo's grasps: force vectors, and slip by friction and by position.
 
-Prints its table and writes docs/benchmarks/shear_slip.md and shear_slip.json.
+The daemon's pipeline computes force vectors and percepts of config/utah_mit_shear.toml. Prints its tables and
+writes docs/benchmarks/shear_slip.md and shear_slip.json.
 """
 
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from bench_percept_grasp import onsets, speeds
-from bench_shear import DRIVE_V, NORMAL_STD, PART_STD, REFERENCE_STD, REFERENCES_N, shear_table
-from grasp_run import drawn_world
-from numpy.typing import NDArray
 from page import made_by, options, output_folder, progress, table
-from scores import score_events
 
-from handtouch.config import load, shipped
-from handtouch.field.elastic_layer import calibrate_layer
-from handtouch.field.shear import ShearPad
-from handtouch.percept.friction import FrictionMonitor
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from bench_percept_grasp import ALARMS, STATED, slips, together
+from grasp_run import Served, drawn_world, served
+from numpy.typing import NDArray
+from scores import Estimates, EstimateScore, bin_labels, concatenate, slices
+
+from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
-from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
-from handtouch.simulate.grasp.tangential import PadForces, pad_forces
-from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
-from handtouch.simulate.worlds import DrawnWorld
+from handtouch.simulate.grasp.tangential import pad_forces
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
-Event = tuple[tuple[str, int], float]
-
-STEPS = 5
-"""Steps of MuJoCo from one sample to the next: 200 Hz."""
-MIN_NORMAL_N, NOISE_A = 0.1, 1e-6
-EARLY_S, LATE_S = 0.2, 0.3
-"""Alarms so long before and after the onset of a slip are of this slip."""
-CONFIRMED_S = 0.1
-"""Time after its onset at which a slip teaches the limit: about the 95 % delay of detection by position."""
-
-
-def forces_on(grasp: GraspRecord, row: int) -> PadForces:
-    """Return MuJoCo's forces on a pad, mean of the steps of each sample."""
-    forces = pad_forces(grasp, row)
-    total = np.vstack([forces.tangential_n, forces.normal_n])
-    sampled = total.reshape(3, -1, STEPS).mean(axis=2)
-    return PadForces(sampled[:2], sampled[2])
+KINDS: dict[str, tuple[str, ...]] = {
+    "position alone": ("motion",),
+    "friction alone": ("friction",),
+    "the first of both": ("motion", "friction"),
+}
+WORLDS = ("default", "harsh")
+LEAD_S = 0.05
+"""Alarms so long before the onset of a slip are of it."""
+SCORED_S = 0.1
+"""From one scored force vector of a pad to the next."""
+MIN_NORMAL_N = 0.1
+_START_NS = 1_000_000_000
 
 
-def measured(forces: PadForces, world: DrawnWorld, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return tangential forces (2, n), covariances (n, 2, 2) and normal forces (n,) of a calibrated pad."""
-    rng = np.random.default_rng((world.seed, sum(map(ord, name))))
-    nominal = shear_table("crossed bars")
-    hidden = world.shear(name)
-    history, moved = LayerHistory(nominal, hidden), [np.zeros(2)]
-    for reference in REFERENCES_N.T:
-        moved.append(history.advance(reference * (1 + REFERENCE_STD * rng.standard_normal()), 2.0))
-        history.advance(np.zeros(2), 2.0)
-    period_s = STEPS * TIME_STEP_S
-    moved += [history.advance(force, period_s) for force in forces.tangential_n.T]
-    path = np.array(moved).T
-    normal = np.concatenate([[0.0], np.full(4, 3.0), np.maximum(forces.normal_n, 0.0)])
-    amperes = SimulatedShearPad(nominal, DRIVE_V, hidden).currents(path, normal, np.zeros_like(path))
-    amperes += NOISE_A * rng.standard_normal(amperes.shape)
-    pad = ShearPad(nominal.build_pattern(), DRIVE_V, nominal.build_film(), PART_STD)
-    found = pad.estimate(amperes, NOISE_A, normal_force_n=normal, centre_std_m=1e-3)
-    displacement = found.motion - found.motion[:, :1]
-    stated = world.world.shear.describe(nominal)
-    layer = calibrate_layer(displacement[:, 1:5], REFERENCES_N, REFERENCE_STD, stated.hysteresis)
-    force = layer.force(displacement[:, 5:], found.covariance[5:], 2.0)
-    scale = 1 + NORMAL_STD * rng.standard_normal()
-    return force.vector_n, force.covariance_n2, scale * forces.normal_n
-
-
-def events_of(
-    grasp: GraspRecord, world: DrawnWorld, *, learns: bool
-) -> tuple[list[Event], list[Event], float]:
-    """Return onsets of slips and alarms by pad, and the time in contact [h]."""
-    speed, period_s = speeds(grasp), STEPS * TIME_STEP_S
-    monitor = FrictionMonitor(len(grasp.pads))
-    true: list[Event] = []
-    alarms: list[Event] = []
-    series: list[tuple[int, tuple[FloatArray, FloatArray, FloatArray], list[float]]] = []
-    for row, pad in enumerate(grasp.pads):
-        forces = forces_on(grasp, row)
-        if forces.normal_n.max() < MIN_NORMAL_N:
+def force_estimates(run: Served, deployment: Deployment) -> Estimates | None:
+    """Return errors of the tangential forces of fingertips, every 0.1 s, along and across the pads' x."""
+    errors, covariances, labels = [], [], []
+    for row, pad in enumerate(run.grasp.pads):
+        if deployment.hands[0].pads[row].shear is None:
             continue
-        found = [step * TIME_STEP_S for step in onsets(speed[:, row])]
-        true += [((grasp.grasped_object.name, row), time_s) for time_s in found]
-        series.append((row, measured(forces, world, f"{grasp.hand}/{pad.link}"), found))
-    labels = dict.fromkeys(range(len(grasp.pads)), "unknown")
-    in_contact = 0
-    for sample in range(len(grasp.times_s) // STEPS):
-        t_s = sample * period_s
-        for row, (force, covariance, normal), found in series:
-            slips = any(0 <= t_s - onset_s < LATE_S for onset_s in found)
-            state = monitor.update(
-                row,
-                t_s,
-                force[:, sample],
-                covariance[sample],
-                float(normal[sample]),
-                max(0.1 * float(normal[sample]), MIN_NORMAL_N / 3),
-                slips=slips,
-            )
-            in_contact += state.label != "unknown"
-            if state.label == "incipient" and labels[row] != "incipient":
-                alarms.append(((grasp.grasped_object.name, row), t_s))
-            labels[row] = state.label
-            if learns and any(0 <= t_s - onset_s - CONFIRMED_S < period_s for onset_s in found):
-                monitor.confirm_slip(row)
-    return true, alarms, in_contact * period_s / 3600
+        true, last_ns = pad_forces(run.grasp, row), 0
+        for contact in run.contacts:
+            step = round((contact.t_ns - _START_NS) * 1e-9 / TIME_STEP_S)
+            if contact.link != pad.link or contact.force_vector_n is None or contact.normal is None:
+                continue
+            if contact.t_ns - last_ns < SCORED_S * 1e9 or true.normal_n[step] < MIN_NORMAL_N:
+                continue
+            last_ns = contact.t_ns
+            normal = np.array(contact.normal)
+            across = np.cross(normal, pad.rotation[:, 0])
+            across /= np.linalg.norm(across)
+            axes = np.stack([np.cross(across, normal), across])
+            covariance = np.reshape(contact.force_vector_covariance_n2 or [np.nan] * 9, (3, 3))
+            errors.append(axes @ contact.force_vector_n - true.tangential_n[:, step])
+            covariances.append(axes @ covariance @ axes.T)
+            labels.append(float(np.hypot(*true.tangential_n[:, step])))
+    if not errors:
+        return None
+    covariance = np.array(covariances)
+    return Estimates(
+        np.array(errors),
+        covariance,
+        np.isfinite(covariance).all(axis=(1, 2)),
+        np.ones(len(errors)),
+        covariance,
+        {"force": bin_labels(labels, (0.3, 1.0), "N")},
+    )
 
 
-def rows_of(world_name: str, seeds: int, objects: list[str]) -> list[Row]:
-    """Return scores of one world: with the prior alone, and with limits learned from slips."""
-    hand = load(shipped.path("utah_mit.toml")).hands[0]
-    parts: dict[bool, list[tuple[list[Event], list[Event], float]]] = {False: [], True: []}
-    for seed in range(1, seeds + 1):
-        for name in objects:
-            world = drawn_world(world_name, seed)
-            grasp = simulate_grasp(hand, name, seed, world)
-            for learns, found in parts.items():
-                true, alarms, hours = events_of(grasp, world, learns=learns)
-                keyed = ([((*key, seed), at) for key, at in events] for events in (true, alarms))
-                found.append((*keyed, hours))  # type: ignore[arg-type]
-            progress(f"{world_name}, seed {seed}: {name}")
-    rows = []
-    for learns, found in parts.items():
-        true = [event for part in found for event in part[0]]
-        alarms = [event for part in found for event in part[1]]
-        hours = sum(part[2] for part in found)
-        score = score_events(true, alarms, hours=hours, early_s=EARLY_S, late_s=LATE_S)
-        ahead = np.mean(score.delays_s < 0) if len(score.delays_s) else np.nan
-        rows.append(
-            {"world": world_name, "limit": "learned from slips" if learns else "prior alone"}
-            | score.row()
-            | {
-                "before the onset, %": float(100 * ahead),
-                "false alarms per minute": score.false_alarms.per_hour / 60,
-            }
-        )
-        del rows[-1]["false alarms per hour"]
-    return rows
+def slip_row(world: str, name: str, runs: Sequence[Served], on: Sequence[str]) -> Row:
+    """Return the scores of one way to detect slip."""
+    scored = [slips(run, ALARMS, KINDS[name], LEAD_S, on) for run in runs]
+    found = together(scored)
+    delays = np.array([delay for of in scored for delay in of["delays"]])
+    before = delays[np.isfinite(delays)] < 0
+    return {
+        "world": world,
+        "alarms by": name,
+        "slips": found["slips"],
+        "detected": found["detected"],
+        "delay, ms, 50 %": found["ms"],
+        "delay, ms, 95 %": found["ms_95"],
+        "before the onset, %": float(100 * before.mean()) if len(before) else np.nan,
+        "grip, min": found["minutes"],
+        "false": found["false"],
+        "false per min": found["false_per_minute"],
+    }
 
 
 def main() -> None:
@@ -151,29 +103,57 @@ def main() -> None:
     args = parser.parse_args()
     objects = list(GRASP_OBJECTS)[: 1 if args.quick else None]
     seeds = 1 if args.quick else args.seeds
-    rows: list[Row] = []
-    for world in ("default", "harsh"):
-        rows += rows_of(world, seeds, objects)
+    plain = load(shipped.path("utah_mit_shear.toml"))
+    hand = plain.hands[0].model_copy(update=STATED)
+    deployment = plain.model_copy(update={"hands": (hand,)})
+    fingertips = [pad.link for pad in hand.pads if pad.shear]
+    slip_rows: list[Row] = []
+    force_rows: list[Row] = []
+    for world in WORLDS[: 1 if args.quick else None]:
+        runs, forces = [], []
+        for seed in range(1, seeds + 1):
+            for name in objects:
+                run = served(deployment, name, seed, drawn_world(world, seed), perceive=True)
+                if (found := force_estimates(run, deployment)) is not None:
+                    forces.append(found)
+                runs.append(run)
+                progress(f"{world}, seed {seed}: {name}")
+        slip_rows += [slip_row(world, name, runs, fingertips) for name in KINDS]
+        every = concatenate(forces)
+        force_rows += [
+            {"world": world, "force": label} | EstimateScore.of_estimates(some).row(bounds=False)
+            for label, some in [("all", every), *slices(every, "force")]
+        ]
     page = [
-        "# Incipient slip from friction ratios",
+        "# Shear pads in grasps",
         "",
         f"{made_by()}.",
         "",
+        f"Grasps of {', '.join(objects)}, {seeds} seeds of the reporting family, as in [percepts of "
+        "grasps](percept_grasp.md): the hand of `config/utah_mit_shear.toml` closes, squeezes twice, and the "
+        "object is pulled out of it. The daemon's pipeline computes force vectors and percepts of the four "
+        "fingertips, spherical pads above shear pads, at 200 Hz; MuJoCo's forces are the truth. Nothing is "
+        "calibrated, no pad is tared.",
+        "",
         *table(
-            "Alarms",
-            f"Grasps of {', '.join(objects)}; seeds: {seeds}; as in [percepts of "
-            "grasps](percept_grasp.md), with the same onsets of slips. All pads carry calibrated shear pads "
-            f"under MuJoCo's tangential forces, read at {1 / (STEPS * TIME_STEP_S):.0f} Hz; normal forces "
-            f"have an error of {100 * NORMAL_STD:g} %. An alarm from {EARLY_S:g} s before an onset to "
-            f"{LATE_S:g} s after it is of that slip, any other one is false; delays are negative before the "
-            f"onset. *Learned*: a slip teaches its ratio {CONFIRMED_S:g} s after its onset, as if position "
-            "had confirmed it, to all pads of the hand.",
-            rows,
+            "Slip",
+            "Onsets of slips, firm grips and false alarms are defined as in [percepts of "
+            "grasps](percept_grasp.md), "
+            f"but alarms from {1e3 * LEAD_S:.0f} ms before an onset on are of it. Delays are those of "
+            "detected slips, negative before the onset; joints are known to 0.2 degrees.",
+            slip_rows,
+        ),
+        *table(
+            "Force vectors",
+            f"Tangential forces of contacts with {MIN_NORMAL_N:g} N and more, in newton, along and across "
+            f"the pad's x, every {SCORED_S:g} s; those of one grasp are of the same drawn pads.",
+            force_rows,
         ),
     ]
     folder = output_folder(args.quick)
     (folder / "shear_slip.md").write_text("\n".join(page))
-    (folder / "shear_slip.json").write_text(json.dumps({"alarms": rows}, indent=1) + "\n")
+    data = {"slip": slip_rows, "forces": force_rows}
+    (folder / "shear_slip.json").write_text(json.dumps(data, indent=1) + "\n")
 
 
 if __name__ == "__main__":

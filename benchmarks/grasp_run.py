@@ -8,6 +8,7 @@ in real time.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +23,7 @@ from handtouch.config import Deployment, Touch
 from handtouch.core.link_poses import LinkPoses
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
+from handtouch.core.slab import ChannelField
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.inputs import InputReceiver
 from handtouch.daemon.percepts import PerceptPublisher
@@ -50,6 +52,9 @@ PARTS = ("pad", "mount", "kinematics", "time")
 _PERIOD_NS, _JOINTS_NS, _ARRIVES_NS = 5_000_000, 10_000_000, 2_000_000
 _START_NS = 1_000_000_000
 _PER_TICK = 5  # steps of MuJoCo
+_PDO_CHANNELS = 4
+_LAYOUT = tuple(ChannelField(k // _PDO_CHANNELS, 16 * (k % _PDO_CHANNELS), 16, True) for k in range(8))
+"""Of a pad with a shear pad: both in TPDOs of their own."""
 
 
 def drawn_world(name: str, seed: int) -> DrawnWorld:
@@ -86,6 +91,8 @@ class Served:
     """Reported contacts by pad."""
     percepts: list[wire.Percept]
     """Published percepts, if requested."""
+    contacts: list[wire.Contact]
+    """Published contact messages, also those without a position in the palm."""
     seed: int = 0
     """Of the hand's parts and mounts."""
 
@@ -116,15 +123,23 @@ def served(
         stimulus = stimulus.with_single_discs(np.array(radii))
     virtual = VirtualHand(deployment, stimulus, world)
     steps = np.arange(0, len(grasp.times_s), _PER_TICK)
-    counts = np.stack([virtual.counts(row, steps * TIME_STEP_S) for row in range(len(hand.pads))], axis=1)
+    times_s = np.asarray(steps * TIME_STEP_S, np.float64)
+    counts = [_readings(virtual, row, times_s) for row in range(len(hand.pads))]
     with zmq.Context() as context:
         run = _Run(deployment, context, grasp, world, perceive)
-        for step, now in zip(steps.tolist(), counts, strict=True):
-            run.tick(step, now)
+        for tick, step in enumerate(steps.tolist()):
+            run.tick(step, [of[tick] for of in counts])
         run.inputs.close()
         run.authenticator.close()
-    railed = int((np.abs(counts) >= 32767).any(axis=2).sum())
+    railed = sum(int((np.abs(of) >= 32767).any(axis=1).sum()) for of in counts)
     return replace(_compared(deployment, grasp, patches, run, railed), seed=seed)
+
+
+def _readings(virtual: VirtualHand, row: int, times_s: FloatArray) -> NDArray[np.int64]:
+    """Return counts (n, c) of a pad at times (n,), followed by those of its shear pad."""
+    shear = virtual.virtual_pads[row].shear
+    own = virtual.counts(row, times_s)
+    return own if shear is None else np.hstack([own, shear.counts(times_s)])
 
 
 class _Run:
@@ -160,6 +175,9 @@ class _Run:
             percepts = np.ones((len(PERCEPT_KINDS), model.size), np.bool_)
             requested = requested._replace(percepts=percepts)
         self.pipeline.apply_demand(requested)
+        for row, (_, pad) in enumerate(deployment.pads):
+            if pad.shear:
+                self.pipeline.slab.set_layout(row, _LAYOUT)
         self._perceiving = PerceptPublisher(
             deployment, self.pipeline, self, process=InlineProcess(deployment)
         )
@@ -180,7 +198,7 @@ class _Run:
         elif isinstance(received, wire.Percept):
             self.percepts.append(received)
 
-    def tick(self, step: int, counts: NDArray[np.int64]) -> None:
+    def tick(self, step: int, counts: Sequence[NDArray[np.int64]]) -> None:
         since_ns = round(step * TIME_STEP_S * 1e9)
         while self._next_ns + _ARRIVES_NS <= since_ns:
             self._send_joints(self._next_ns)
@@ -188,7 +206,9 @@ class _Run:
         t_ns = _START_NS + since_ns
         self.pipeline.begin_cycle(t_ns, t_ns)
         for pad, now in enumerate(counts):
-            self.pipeline.slab.write_pdo(pad, now.astype("<i2").tobytes(), t_ns + 1)
+            for pdo, first in enumerate(range(0, len(now), _PDO_CHANNELS)):
+                data = now[first : first + _PDO_CHANNELS].astype("<i2").tobytes()
+                self.pipeline.slab.write_pdo(pad, data, t_ns + 1, pdo)
         ticked = self.pipeline.tick_if_due(t_ns + 7 * _PERIOD_NS // 10)
         assert ticked is not None
         self._perceiving.process_tick(ticked, t_ns)
@@ -273,6 +293,7 @@ def _compared(
         railed,
         spans,
         run.percepts,
+        run.contacts,
     )
 
 

@@ -186,7 +186,7 @@ def _add_scene(commands: Subparsers) -> None:
         type=comma_separated,
         metavar="NAMES",
         help="outputs in use, of position, force, raw (samples), palm and base (positions in these frames), "
-        'motion (slip), stiffness, shape, texture; "": only whether a pad is touched',
+        'motion (slip), stiffness, shape, texture, friction; "": only whether a pad is touched',
     )
     scene.add_argument("--rate-hz", type=float, metavar="HZ", help="rate of contact updates; 0: one per SYNC")
     scene.add_argument(

@@ -145,7 +145,8 @@ def add_percepts(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--percepts",
         action="store_true",
-        help="also subscribe to percepts (slip, stiffness, shape, texture), so that the daemon computes them",
+        help="also subscribe to percepts (slip, stiffness, shape, texture, friction), so that the daemon "
+        "computes them",
     )
 
 

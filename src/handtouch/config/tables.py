@@ -26,7 +26,9 @@ NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
-Output = Literal["position", "force", "raw", "palm", "base", "motion", "stiffness", "shape", "texture"]
+Output = Literal[
+    "position", "force", "raw", "palm", "base", "motion", "stiffness", "shape", "texture", "friction"
+]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 MIN_ELECTRODES, MAX_ELECTRODES = 3, 16
 Electrode = Literal["x0", "xa", "y0", "yb"]
@@ -388,8 +390,8 @@ class Pad(Table):
     mount: Mount = Field(Mount(), description="pose of the pad on its link")
     shear: Name | None = Field(
         None,
-        description="kind of shear pad beneath this flat pad, a [shear.NAME] table, on channels of the same "
-        "node; x along x, its centre at the pad's; default: none",
+        description="kind of shear pad beneath this pad, a [shear.NAME] table, on channels of the same node; "
+        "x along x, its centre at the pad's; default: none",
     )
     shear_electrodes: Annotated[tuple[Name, ...], Field(strict=False)] = Field(
         SIDE_ELECTRODES,

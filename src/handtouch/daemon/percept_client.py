@@ -24,7 +24,7 @@ from handtouch.core.tick import TickResult
 from handtouch.daemon.child_process import ChildProcess
 from handtouch.hand.joints import JointSnapshot
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
-from handtouch.wire import PERCEPT_KINDS
+from handtouch.wire import PERCEPT_KINDS, ForceStatus, PositionStatus
 
 IntArray = NDArray[np.intp]
 _IDLE_PERIOD_NS = 50_000_000
@@ -172,6 +172,7 @@ class PerceptClient:
             retained=False,
             **fields,
             **self._palm_columns(rows),
+            **self._shear_columns(rows),
             **self._commanded_columns(rows, sync_ns),
         )
 
@@ -187,6 +188,20 @@ class PerceptClient:
             "palm_rotation": rotation.tobytes(),
             "palm_joints_m2": joints_m2.tobytes(),
             "joints_age_s": age_s.tobytes(),
+        }
+
+    def _shear_columns(self, rows: IntArray) -> dict[str, bytes]:
+        """Return force vectors, NaN where there is none or no ratio with the normal force."""
+        tick = self._pipeline.tick
+        if not (tick.shear.any_configured and len(rows)):
+            return {}
+        status, vector = tick.state.force_vector_status[rows], tick.state.force_vector[rows]
+        usable = np.isin(status, (ForceStatus.VALID, ForceStatus.UNRELIABLE))
+        usable &= tick.columns.position_status[rows] == PositionStatus.VALID
+        vector[~usable] = np.nan
+        return {
+            "force_vector_n": vector[:, :3].tobytes(),
+            "force_vector_covariance_n2": vector[:, 3:].tobytes(),
         }
 
     def _commanded_columns(self, rows: IntArray, sync_ns: int) -> dict[str, bytes]:

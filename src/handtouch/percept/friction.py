@@ -10,29 +10,27 @@ learned in ratios as they are measured: what is wrong with a pad's stiffness is 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-FloatArray = NDArray[np.float64]
-
-PRIOR_LOG_STD = 0.35
-"""Standard deviation of ln(limit) before anything is known: objects differ by that, and so do pads."""
-_SLIP_LOG_STD = 0.08  # of one observed slip: the limit varies over an object and between pads
+PRIOR_LIMIT, PRIOR_LOG_STD = 0.8, 0.35
+"""Limit of friction before anything is known, with the standard deviation of its logarithm: objects differ by
+that, and so do pads."""
+_SLIP_LOG_STD = 0.4  # of one observed slip: pads and spots differ, and slips are observed late
+_MIN_LOG_STD = 0.25
+_MIN_SLIP_PROBABILITY = (
+    0.01  # of a limit below an observed slip's ratio; a rarer slip was none: the pad rolled
+)
+_SLIP_SPAN_S = 0.1  # before a slip is observed, in which the greatest ratio was the limit
 _STICK_LOG_STD = 0.05  # noise of the ratio of a contact that sticks
-_STUCK_SHARE = 0.7  # of the ratio of a slip: what stuck above it, stuck on another spot
 _RATE_TIME_S = 0.02  # smoothing of the ratio's rate
-_HORIZON_S = 0.03
-_MIN_NORMAL_SIGMA = 3.0  # normal force in its standard deviations, below which there is no ratio
+_HORIZON_S = 0.02
+_MIN_NORMAL_SIGMA = 1.5  # normal force in its standard deviations, below which there is no ratio
 _STICK_S = 0.1  # a ratio that a contact held for so long stuck; a faster rise teaches nothing yet
-_ALARM, _CLEAR = 0.3, 0.15  # probability of incipient slip that raises and clears it
+_ALARM, _CLEAR = 0.25, 0.12  # probability of incipient slip that raises and clears it
 _MAX_GAP_S = 0.1
-
-
-_NOTHING_HELD = (math.nan, math.nan)
+_MAX_RELATIVE_STD = 1.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class FrictionLimit:
     mean, log_std: of the normal part. stuck: greatest ratio without slip, 0 at first.
     """
 
-    mean: float = 0.8
+    mean: float = PRIOR_LIMIT
     log_std: float = PRIOR_LOG_STD
     stuck: float = 0.0
 
@@ -51,22 +49,27 @@ class FrictionLimit:
         return replace(self, stuck=max(self.stuck, ratio))
 
     def after_slip(self, ratio: float) -> FrictionLimit:
-        """Return the belief after a contact began to slip at a ratio; earlier bounds above it are dropped.
+        """Return the belief after a contact began to slip at a ratio.
 
-        Raises ValueError for a ratio that isn't positive.
+        The same belief if the limit can't be so low: then the motion was no slip. Raises ValueError for a
+        ratio that isn't positive.
         """
         if not ratio > 0:
             raise ValueError(f"ratio must be positive, got {ratio}")
+        if self.probability_below(ratio) < _MIN_SLIP_PROBABILITY:
+            return self
         before, now = self.log_std**-2, _SLIP_LOG_STD**-2
         mean = (before * math.log(self.mean) + now * math.log(ratio)) / (before + now)
-        spread = max((before + now) ** -0.5, _SLIP_LOG_STD / 2)
-        return FrictionLimit(math.exp(mean), spread, min(self.stuck, _STUCK_SHARE * ratio))
+        spread = max((before + now) ** -0.5, _MIN_LOG_STD)
+        return replace(self, mean=math.exp(mean), log_std=spread)
 
-    def probability_below(self, ratio: float) -> float:
-        """Return the probability that the limit is below a ratio, given that `stuck` stuck."""
+    def probability_below(self, ratio: float, relative_std: float = 0.0) -> float:
+        """Return the probability that the limit is below a ratio of this relative error, given that `stuck`
+        stuck.
+        """
         if ratio <= 0:
             return 0.0
-        width = math.hypot(self.log_std, _STICK_LOG_STD)
+        width = math.sqrt(self.log_std**2 + _STICK_LOG_STD**2 + min(relative_std, _MAX_RELATIVE_STD) ** 2)
         above = float(log_ndtr((math.log(self.mean) - math.log(ratio)) / width))
         if self.stuck > 0:
             above -= float(log_ndtr((math.log(self.mean) - math.log(self.stuck)) / width))
@@ -78,8 +81,8 @@ class FrictionState:
     """Friction of one contact at one sample.
 
     ratio, ratio_std: tangential over normal force. rate_per_s: of the ratio. margin: 1 - ratio / limit, below
-    0 beyond the mean limit. probability: that the limit is reached within 30 ms at this rate. label:
-    "unknown" without a ratio, "sticking" or "incipient".
+    0 beyond the mean limit. probability: that the limit is reached within 20 ms at this rate. label:
+    "sticking" or "incipient".
     """
 
     ratio: float
@@ -90,78 +93,84 @@ class FrictionState:
     label: str
 
 
-_UNKNOWN = FrictionState(math.nan, math.nan, 0.0, math.nan, 0.0, "unknown")
+@dataclass(slots=True)
+class _Contact:
+    """Memory of the contact on one pad."""
+
+    time_s: float
+    ratio: float
+    rate: float = 0.0
+    alarmed: bool = False
+    slips: bool = False
+    held_since_s: float = math.nan
+    held: float = math.nan
+    """least ratio since then"""
+    peak_s: float = -math.inf
+    peak: float = 0.0
+    """greatest ratio of the last `_SLIP_SPAN_S`, and its time"""
 
 
 class FrictionMonitor:
-    """Friction of the contacts on n pads of one hand, which hold one object with one limit.
+    """Friction of the contacts of one hand, which hold one object with one limit; pads are any numbers.
 
     `limit` is what is known of it; assign a new `FrictionLimit` for another object.
     """
 
-    def __init__(self, pads: int, limit: FrictionLimit | None = None) -> None:
+    def __init__(self, limit: FrictionLimit | None = None) -> None:
         self.limit = limit or FrictionLimit()
-        self._time_s = [math.nan] * pads
-        self._ratio = [math.nan] * pads
-        self._rate = [0.0] * pads
-        self._alarmed = [False] * pads
-        self._held: list[tuple[float, float]] = [_NOTHING_HELD] * pads
+        self._contacts: dict[int, _Contact] = {}
 
     def end_contact(self, pad: int) -> None:
         """Forget the contact on a pad."""
-        self._time_s[pad] = self._ratio[pad] = math.nan
-        self._rate[pad], self._alarmed[pad], self._held[pad] = 0.0, False, _NOTHING_HELD
-
-    def confirm_slip(self, pad: int) -> None:
-        """Learn from a slip on a pad that was observed by its motion: the ratio there is the limit."""
-        if self._ratio[pad] > 0:
-            self.limit = self.limit.after_slip(self._ratio[pad])
+        self._contacts.pop(pad, None)
 
     def update(
         self,
         pad: int,
         t_s: float,
-        force_n: Sequence[float] | FloatArray,
-        covariance_n2: FloatArray,
-        normal_n: float,
-        normal_std_n: float,
+        tangential: tuple[float, float],
+        normal: tuple[float, float],
         *,
         slips: bool = False,
-    ) -> FrictionState:
-        """Process a sample: tangential force (2,) with covariance (2, 2), normal force with its standard
-        deviation; `slips`: its motion shows a slip, so that it teaches no bound.
-        """
-        fx, fy = np.asarray(force_n, np.float64).tolist()
-        if not (normal_n > _MIN_NORMAL_SIGMA * normal_std_n and math.isfinite(fx + fy)):
-            self.end_contact(pad)
-            return _UNKNOWN
-        size = math.hypot(fx, fy)
-        ratio = size / normal_n
-        way = np.array([fx, fy]) / size if size > 0 else np.array([1.0, 0.0])
-        spread = math.hypot(
-            math.sqrt(float(way @ covariance_n2 @ way)) / normal_n, ratio * normal_std_n / normal_n
-        )
-        elapsed = t_s - self._time_s[pad]
-        if 0 < elapsed < _MAX_GAP_S:
-            share = -math.expm1(-elapsed / _RATE_TIME_S)
-            self._rate[pad] += share * ((ratio - self._ratio[pad]) / elapsed - self._rate[pad])
-        else:
-            self._rate[pad] = 0.0
-        self._time_s[pad], self._ratio[pad] = t_s, ratio
-        ahead = ratio + _HORIZON_S * max(self._rate[pad], 0.0)
-        probability = self.limit.probability_below(ahead)
-        self._alarmed[pad] = probability > (_CLEAR if self._alarmed[pad] else _ALARM)
-        self._learn_sticking(pad, t_s, ratio, sticks=not (slips or self._alarmed[pad]))
-        label = "incipient" if self._alarmed[pad] else "sticking"
-        return FrictionState(ratio, spread, self._rate[pad], 1 - ratio / self.limit.mean, probability, label)
+    ) -> FrictionState | None:
+        """Process a sample; return None where the normal force is too uncertain for a ratio.
 
-    def _learn_sticking(self, pad: int, t_s: float, ratio: float, *, sticks: bool) -> None:
+        tangential, normal: forces [N], each with its standard deviation, the tangential one's along itself.
+        slips: its motion shows a slip.
+        """
+        (size_n, size_std_n), (normal_n, normal_std_n) = tangential, normal
+        if not (normal_n > _MIN_NORMAL_SIGMA * normal_std_n and math.isfinite(size_n + size_std_n)):
+            self.end_contact(pad)
+            return None
+        ratio = size_n / normal_n
+        spread = math.hypot(size_std_n / normal_n, ratio * normal_std_n / normal_n)
+        contact = self._contacts.get(pad)
+        if contact is None or not t_s - contact.time_s < _MAX_GAP_S:
+            contact = self._contacts[pad] = _Contact(t_s, ratio)
+        if (elapsed := t_s - contact.time_s) > 0:
+            share = -math.expm1(-elapsed / _RATE_TIME_S)
+            contact.rate += share * ((ratio - contact.ratio) / elapsed - contact.rate)
+        contact.time_s, contact.ratio = t_s, ratio
+        if ratio >= contact.peak or t_s - contact.peak_s > _SLIP_SPAN_S:
+            contact.peak_s, contact.peak = t_s, ratio
+        ahead = ratio + _HORIZON_S * max(contact.rate, 0.0)
+        # the normal force's error is mostly the pad's, and so in the limit too
+        probability = self.limit.probability_below(ahead, size_std_n / size_n if size_n > 0 else 0.0)
+        contact.alarmed = probability > (_CLEAR if contact.alarmed else _ALARM)
+        if slips and not contact.slips and contact.peak > 0:
+            self.limit = self.limit.after_slip(contact.peak)
+        contact.slips = slips
+        self._learn_sticking(contact, sticks=not (slips or contact.alarmed))
+        label = "incipient" if contact.alarmed else "sticking"
+        return FrictionState(ratio, spread, contact.rate, 1 - ratio / self.limit.mean, probability, label)
+
+    def _learn_sticking(self, contact: _Contact, *, sticks: bool) -> None:
         """Learn the least ratio of each span of `_STICK_S` in which a contact sticks."""
-        begin_s, least = self._held[pad]
-        if not sticks or math.isnan(begin_s):
-            self._held[pad] = (t_s, ratio) if sticks else _NOTHING_HELD
-        elif t_s - begin_s < _STICK_S:
-            self._held[pad] = begin_s, min(least, ratio)
+        if not sticks:
+            contact.held_since_s = math.nan
+        elif contact.time_s - contact.held_since_s < _STICK_S:
+            contact.held = min(contact.held, contact.ratio)
         else:
-            self.limit = self.limit.after_sticking(least)
-            self._held[pad] = t_s, ratio
+            if not math.isnan(contact.held_since_s):
+                self.limit = self.limit.after_sticking(contact.held)
+            contact.held_since_s, contact.held = contact.time_s, contact.ratio

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.percept.action_request import ActionRequest, ActionSelector, Question
+from handtouch.percept.friction_estimator import FrictionEstimator
 from handtouch.percept.samples import (
     ContactBuffer,
     ContactSamples,
@@ -50,12 +51,22 @@ class PerceptPipeline:
         self._next_estimator = 0  # the first to offer a fit
 
     @classmethod
-    def build(cls, buffer: ContactBuffer, pair_m: PairDistanceFunction | None = None) -> PerceptPipeline:
-        """Return a pipeline of all estimators. pair_m: see `ShapeEstimator`."""
+    def build(
+        cls,
+        buffer: ContactBuffer,
+        pair_m: PairDistanceFunction | None = None,
+        shear_pads: NDArray[np.bool_] | None = None,
+    ) -> PerceptPipeline:
+        """Return a pipeline of all estimators.
+
+        pair_m: see `ShapeEstimator`; shear_pads: (n,), pads above shear pads, by default none.
+        """
+        above_shear = np.zeros(buffer.size, np.bool_) if shear_pads is None else shear_pads
         parts = (
             StiffnessEstimator(buffer.size),
             ShapeEstimator(buffer.size, pair_m=pair_m),
             TextureEstimator(buffer.size),
+            FrictionEstimator(above_shear),
         )
         return cls(buffer, parts)
 

@@ -43,6 +43,8 @@ SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
     "slip_log_odds": (),  # ln of the odds of slip; infinite while it slips
     "slip_velocity_m_per_s": (2,),  # on the pad, where slip is likely
     "tremor_std_m": (2,),  # as learnt
+    "force_vector_n": (3,),  # in the link's frame, above a shear pad
+    "force_vector_covariance_n2": (3, 3),
     "commanded_m": (),  # commanded displacement of the link along the normal since the contact began
     "commanded_normal": (3,),  # in the palm frame, at the commanded joint positions
 }

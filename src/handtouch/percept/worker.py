@@ -42,7 +42,8 @@ class PerceptWorker:
         self._placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
         self.contacts = ContactBuffer(n, [self._hands.index(name) for name in names])
         """latest samples of every contact"""
-        self._pipeline = PerceptPipeline.build(self.contacts, self.pair_distance_m)
+        shear_pads = np.array([pad.shear is not None for pad in pads], np.bool_)
+        self._pipeline = PerceptPipeline.build(self.contacts, self.pair_distance_m, shear_pads)
         self._requested = np.zeros(n, dtype=np.uint8)
         self._commanded_motion = CommandedMotion(n)
         self._xy = np.full((n, 2), np.nan)  # of the last samples

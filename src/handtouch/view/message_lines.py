@@ -113,6 +113,7 @@ _MAIN_VALUE = {
     "stiffness": "stiffness_n_per_m",
     "shape": "radius_m",
     "texture": "period_m",
+    "friction": "ratio",
 }
 """Kind of a percept -> its principal value."""
 _CONFIDENCE_STEP = 0.05

@@ -22,8 +22,8 @@ Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
 ContactEvent = Literal["begin", "update", "end"]
 
-PerceptKind = Literal["motion", "stiffness", "shape", "texture", "action_request"]
-PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture")
+PerceptKind = Literal["motion", "stiffness", "shape", "texture", "friction", "action_request"]
+PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture", "friction")
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""

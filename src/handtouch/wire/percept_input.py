@@ -75,6 +75,10 @@ class PerceptInput:
     """part of `palm_covariance_m2` from joints, mean per axis"""
     joints_age_s: Annotated[bytes, Column("<f8")] = b""
     """as in `contact`"""
+    force_vector_n: Annotated[bytes, Column("<f8", 3)] = b""
+    """as in `contact`, of contacts above shear pads whose position is valid and whose force no lower bound"""
+    force_vector_covariance_n2: Annotated[bytes, Column("<f8", 9)] = b""
+    """its covariance, row by row"""
     commanded_pose: Annotated[bytes, Column("<f8", 12)] = b""
     """rotation and translation of the link in the palm's frame at the commanded joint positions, row by row;
     only where the palm's frame isn't known otherwise"""
