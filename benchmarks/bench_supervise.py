@@ -15,7 +15,7 @@ import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from page import made_by, options, output_folder, progress
-from scores import Estimates, EstimateScore, concatenate, slices
+from scores import ClusterShare, Estimates, EstimateScore, Share, concatenate, slices
 from sheet_use import FULL_N, drawn_sheets, score_use
 
 from handtouch.config import Behaviour, load, shipped
@@ -35,7 +35,7 @@ from handtouch.core.slab import Cycle, Slab
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor
 from handtouch.simulate.electronics_drift import ElectronicsDrift
-from handtouch.simulate.worlds import WORLDS, Family
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, Family, SheetKind
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -46,8 +46,8 @@ PERIOD_NS, TICK_NS = 100_000_000, 5_000_000
 DRIFTS = {name: world.only("electronics").draw(Family.REPORTING.seed(71)) for name, world in WORLDS.items()}
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
-PADS, SEEDS = 20, (31, 32)
-"""Sheets of each kind, and seeds of their use."""
+PADS, SEEDS = 8, (31, 32, 33)
+"""Sheets of each kind, and seeds of worlds and use."""
 DAY, PARTS = "Hours of mixed use of sheets", "Effect of the parts"
 WARM, TURNED = "A hand that gets warm", "A hand that is turned over"
 INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"
@@ -284,32 +284,56 @@ def slow(quick: bool) -> Rows:
 
 
 CUTS: dict[str, dict[str, Any]] = {
-    "complete": {},
-    "no forgetting": {"forget_time_s": 1e9},
-    "no parameter uncertainty": {"parameter_std_fraction": 0.0},
     "no adaptation compensation": {"adaptation_share": 0.0},
     "no creep compensation": {"creep_share": 0.0},
-    "no compensation": {"adaptation_share": 0.0, "creep_share": 0.0},
+    "no parameter uncertainty": {"parameter_std_fraction": 0.0},
 }
+"""Changes of what the deployment file states."""
+COMPLETE, UNLEARNED = "", "nothing learned"
+PAPER = ("S1", "S2")
 
 
-def used(world: str, cut: str, hours: float, seed: int, pads: int) -> Estimates:
+def kinds_of(world: str) -> tuple[SheetKind, ...]:
+    """Return the kinds of sheets that are measured in a world, those of the paper among them."""
+    kinds = () if world == "harsh" else tuple(SHEET_KINDS[name] for name in PAPER)
+    return (*WORLDS[world].sheets.kinds(Family.REPORTING), *kinds)
+
+
+def used(world: str, part: str, hours: float, seed: int, pads: int) -> Estimates:
     """Return force errors of all kinds of sheets of a world, with a part of the compensation left out."""
     drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
-    sheets = [
-        drawn_sheets(drawn, kind, pads, kind.behaviour.model_copy(update=CUTS[cut]))
-        for kind in drawn.world.sheets.kinds(Family.REPORTING)
-    ]
-    return score_use(sheets, hours, drawn.seed)
+    sheets = [drawn_sheets(drawn, kind, pads) for kind in kinds_of(world)]
+    if part in CUTS:
+        sheets = [replace(some, behaviour=some.behaviour.model_copy(update=CUTS[part])) for some in sheets]
+    return score_use([replace(some, learns=part != UNLEARNED) for some in sheets], hours, drawn.seed)
+
+
+def of_kinds(world: str, every: Estimates) -> Estimates:
+    """Return the rows of the world's own kinds."""
+    own = [kind.name for kind in WORLDS[world].sheets.kinds(Family.REPORTING)]
+    return every.where(np.isin(every.columns["kind"], own or PAPER))
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
 
 
 def force_row(some: Estimates, **names: str) -> dict[str, Any]:
-    """Return a row of a table: scores of forces, and the error without compensation."""
-    raw = some.columns["uncompensated"][some.valid]
+    """Return a row of a table: forces with and without compensation."""
+    good = some.where(some.valid)
+    inside = good.distances() <= 1.96
+    raw, error = rms(good.columns["uncompensated"]), rms(good.error)
     return {
         **names,
-        **EstimateScore.of_estimates(some).row(bounds=False),
-        "rms error, uncompensated": float(np.sqrt(np.mean(np.square(raw)))) if len(raw) else math.nan,
+        "touches": len(some),
+        "pads": len(np.unique(some.columns["pad"])),
+        "uncompensated, N": raw,
+        "compensated, N": error,
+        "ratio": f"{error / raw:.2f}",
+        "in 95 %": str(Share.of_mask(inside)),
+        "by pad": str(ClusterShare.of_mask(inside, good.columns["pad"])),
+        "median width, N": 2 * 1.96 * float(np.median(np.sqrt(good.covariance))),
+        "valid, %": f"{100 * some.valid.mean():.1f}",
     }
 
 
@@ -321,7 +345,7 @@ def by_hour(some: Estimates) -> list[list[float]]:
         on = (hour >= low) & (hour < high)
         if on.any():
             parts = (good.columns["uncompensated"][on], good.error[on, 0], np.sqrt(good.covariance[on, 0, 0]))
-            found.append([float(low), *(float(np.sqrt(np.mean(np.square(part)))) for part in parts)])
+            found.append([float(low), *(rms(part) for part in parts)])
     return found
 
 
@@ -439,13 +463,18 @@ Errors are against the grip's first seconds, and against the touch before.""",
 with the same grip for ten. Each channel reads 4 counts (rms) more for a unit of gravity along each axis of
 its link.""",
         "Slow presses": "On a pad of the shipped hand, begin_threshold_n 0.06 N, max_rise_time_s 20.",
-        DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family for
-{hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to {FULL_N:g} N, half of them waxing
-and waning, and breaks. The deployment file describes sheets as their builder would; contact layers differ as
-in the world. Contacts are given their load: errors of position, currents and radius are in
-[worlds](worlds.md). One reading of each contact, at a random age. Errors and deviations in N; shares in %,
-with 95 % intervals of binomial counts: contacts of one sheet share its hidden quantities.""",
-        PARTS: "Both seeds, all kinds of a world together, without some parts; an eighth of the time.",
+        DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and of
+the paper's two, for {hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to
+{FULL_N:g} N, half of them waxing and waning, and breaks. The deployment file describes sheets as their builder would;
+contact layers differ as in the world. Contacts are given their load: errors of position, currents and
+radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the paper's are there exactly as in
+the file, one seed. One reading of each contact, at a random age. Errors rms of valid forces; *ratio*:
+compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation of the file instead of
+learned ones, which is what handtouch compensated before it learned any. *In 95 %*: share of readings within
+the stated interval, with the 95 % interval of a binomial count; *by pad*: with that of the scatter between
+pads, as readings of one pad share gain and parameters. *Width* of the stated 95 % interval. *All* are the
+world's own kinds, also by age of the contact.""",
+        PARTS: "The first seed in `default`, its own kinds, without some parts; a third of the time.",
         "Cost": f"Medians in us; {machine}. Sheets: S1, half of the pads touched.",
     }
 
@@ -454,7 +483,7 @@ def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
     lines = [
         "# Baseline and sheet force compensation",
         "",
-        "![mixed use of two sheets, slow presses](supervise.png)",
+        "![mixed use of sheets, slow presses](supervise.png)",
         "",
     ]
     texts = notes(hours, held_s)
@@ -464,27 +493,31 @@ def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
 
 
 def force_tables(found: dict[tuple[str, str], Estimates]) -> tuple[Rows, Rows]:
-    """Return the rows of the whole and of its parts, from what was found by world and cut."""
+    """Return the rows of the whole and of its parts, from what was found by world and part."""
     whole: Rows = []
-    for world in SHEET_WORLDS:
-        every = found[world, ""]
-        whole += [force_row(some, world=world, sheet=kind) for kind, some in slices(every, "kind")]
-        whole += [force_row(some, world=world, sheet=f"all, {age}") for age, some in slices(every, "age")]
-        whole.append(force_row(every, world=world, sheet="all"))
-    parts = [force_row(some, world=world, part=cut) for (world, cut), some in found.items() if cut]
+    for world in WORLDS:
+        every, before = found[world, COMPLETE], found.get((world, UNLEARNED))
+        own = of_kinds(world, every)
+        chosen = [(kind, every.columns["kind"] == kind, some) for kind, some in slices(every, "kind")]
+        in_own = np.isin(every.columns["kind"], own.columns["kind"])
+        for age, some in slices(own, "age"):
+            chosen.append((f"all, {age}", in_own & (every.columns["age"] == age), some))
+        for name, rows, some in (*chosen, ("all", in_own, own)):
+            row = force_row(some, world=world, sheet=name)
+            row["nothing learned, N"] = rms(before.error[rows & before.valid]) if before else "-"
+            whole.append(row)
+    parts = [
+        force_row(of_kinds(world, some), part=part) for (world, part), some in found.items() if part in CUTS
+    ]
     return whole, parts
-
-
-SHEET_WORLDS = ("default", "harsh")
-"""Worlds whose sheets have a behaviour."""
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--hours", type=float, default=8.0, help="of mixed use (default: 8)")
+    parser.add_argument("--hours", type=float, default=6.0, help="of mixed use (default: 6)")
     asked = parser.parse_args()
     quick = asked.quick
-    hours, held_s, pads = (0.25, 120.0, 4) if quick else (asked.hours, 3600.0, PADS)
+    hours, held_s, pads = (0.25, 120.0, 2) if quick else (asked.hours, 3600.0, PADS)
     names = list(HALVES)
     tasks: list[tuple[str, Callable[..., Any], tuple[Any, ...]]] = []
     tasks += [("Held object", held, (world, names[0], held_s)) for world in WORLDS]
@@ -493,20 +526,23 @@ def main() -> None:
     tasks += [(TURNED, turned, (known,)) for known in (True, False)]
     tasks += [("Slow presses", slow, (quick,))]
     with ProcessPoolExecutor(2) as pool:
-        seeds = SEEDS[: 1 if quick else None]
+        parts_of: dict[tuple[str, str], tuple[int, ...]] = {
+            (world, COMPLETE): SEEDS[:1] if quick or world == "ideal" else SEEDS for world in WORLDS
+        }
+        parts_of["default", UNLEARNED] = parts_of["default", COMPLETE]
+        parts_of |= {("default", part): SEEDS[:1] for part in CUTS}
         running = {
-            (world, cut): [
-                pool.submit(used, world, cut or "complete", hours / (8 if cut else 1), seed, pads)
+            (world, part): [
+                pool.submit(used, world, part, hours / (3 if part in CUTS else 1), seed, pads)
                 for seed in seeds
             ]
-            for cut in ("", *CUTS)
-            for world in SHEET_WORLDS
+            for (world, part), seeds in parts_of.items()
         }
         waiting = [(title, pool.submit(call, *given)) for title, call, given in tasks]
         found: dict[tuple[str, str], Estimates] = {}
         for key, futures in running.items():
             found[key] = concatenate([future.result() for future in futures])
-            progress(f"sheets of {key[0]}, {key[1] or 'all hours'}: {len(found[key])} contacts")
+            progress(f"sheets of {key[0]}, {key[1] or 'complete'}: {len(found[key])} contacts")
         parts: dict[str, Rows] = {title: [] for title in ("Held object", WARM, TURNED, "Slow presses")}
         for title, future in waiting:
             parts[title].extend(future.result())
@@ -516,7 +552,7 @@ def main() -> None:
     text = page(parts, hours, held_s)
     print(text)
     out = output_folder(quick)
-    curves = {world: by_hour(found[world, ""]) for world in SHEET_WORLDS}
+    curves = {world: by_hour(of_kinds(world, found[world, COMPLETE])) for world in ("default", "harsh")}
     (out / "supervise.md").write_text(text)
     scores = {", ".join(key): asdict(EstimateScore.of_estimates(some)) for key, some in found.items()}
     record = json.dumps({**parts, "curves": curves, "scores": scores}, indent=1).replace("NaN", "null")

@@ -7,7 +7,7 @@ apparent ones through the compensation; one reading of each contact is compared,
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,13 +16,21 @@ from numpy.typing import NDArray
 from scores import Estimates, bin_labels
 
 from handtouch.config import Behaviour
-from handtouch.core.sheet_force import ForceReliability, SheetForceCompensation, sheet_behaviour_of
+from handtouch.core.sheet_force import (
+    ForceReliability,
+    SheetBehaviour,
+    SheetForceCompensation,
+    sheet_behaviour_of,
+)
 from handtouch.core.state import TickState
+from handtouch.sheet import BankPrior
 from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
 from handtouch.simulate.worlds import DrawnWorld, SheetKind
 
 FloatArray = NDArray[np.float64]
 FULL_N = 5.0
+CERTAIN = BankPrior(log_time_std=1e-12, not_adapting=1e-30, exponent_std=0.0)
+"""Prior of a sheet of which nothing is to be learned."""
 ALPHA = 1.5
 """Exponent of the contact law: a layer of r times the resistance reads r^(-1 / alpha) times the force."""
 DT_S = 0.4
@@ -38,15 +46,26 @@ class Sheets:
     laws: tuple[SheetLaw, ...]
     gains: FloatArray
     """(n,), force that a fresh sheet reads over the true one."""
-    behaviour: Behaviour | None
+    behaviour: Behaviour
     """What the deployment file states of them."""
+    law_std: float
+    """Relative standard deviation of a force by the stated tolerance of the contact layer."""
+    learns: bool = True
+    """Whether creep and adaptation are learned from use, as by the daemon; else they are the file's."""
 
 
-def drawn_sheets(drawn: DrawnWorld, kind: SheetKind, pads: int, behaviour: Behaviour | None = None) -> Sheets:
-    """Return pads of a kind with what the drawn world hides; `behaviour`: another than its builder's."""
-    ratios = drawn.world.sheets.contact_ohm_ratio.sample(np.random.default_rng((drawn.seed, 8)), pads)
+def drawn_sheets(drawn: DrawnWorld, kind: SheetKind, pads: int) -> Sheets:
+    """Return pads of a kind with what the drawn world hides, as the builder describes them."""
+    layer = drawn.world.sheets.contact_ohm_ratio
+    ratios = layer.sample(np.random.default_rng((drawn.seed, 8, *kind.name.encode())), pads)
     laws = tuple(kind.varied(*drawn.sheet_factors(f"{kind.name}/{pad}")) for pad in range(pads))
-    return Sheets(kind.name, laws, ratios ** (-1 / ALPHA), behaviour or kind.behaviour)
+    return Sheets(kind.name, laws, ratios ** (-1 / ALPHA), kind.behaviour, layer.std / ALPHA)
+
+
+def stated_behaviour(sheets: Sheets) -> SheetBehaviour:
+    """Return the behaviour that the daemon makes of the deployment file."""
+    stated = sheet_behaviour_of(sheets.behaviour, sheets.name)
+    return stated if sheets.learns else replace(stated, prior=CERTAIN)
 
 
 class Use:
@@ -95,21 +114,18 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
     rng = np.random.default_rng((seed, 9))
     laws = [law for some in sheets for law in some.laws]
     states = [SheetState.fresh(law) for law in laws]
-    behaviours = [
-        sheet_behaviour_of(some.behaviour, some.name) if some.behaviour else None
-        for some in sheets
-        for _ in some.laws
-    ]
+    behaviours = [stated_behaviour(some) for some in sheets for _ in some.laws]
     held = TickState.empty(len(laws))
     compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9), held)
-    is_modelled = np.array([behaviour is not None for behaviour in behaviours])
     gains = np.concatenate([some.gains for some in sheets])
+    law_std = np.repeat([some.law_std for some in sheets], [len(some.laws) for some in sheets])
     kind = np.repeat([some.name for some in sheets], [len(some.laws) for some in sheets])
     use = Use(len(laws), rng)
     compared, press = np.zeros(len(laws), np.bool_), np.ones(len(laws))
     press_std = np.array([law.press_std for law in laws])
     noise_std = np.array([law.noise_std for law in laws])
-    touching, none, t_ns, gone_s = np.zeros(len(laws), np.bool_), np.zeros(len(laws)), 10**9, 0.0
+    touching, loaded = np.zeros((2, len(laws)), np.bool_)
+    none, t_ns, gone_s = np.zeros(len(laws)), 10**9, 0.0
     held.uncompensated_force_n[:] = held.uncompensated_std_n[:] = 0.0
     compensation.compensate_forces(t_ns)
     rows: list[dict[str, Any]] = []
@@ -119,12 +135,10 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
             t_ns += round(dt_s * 1e9)
             gone_s += dt_s
             step = partial(advance, dt_s=dt_s, is_excited=True, warmer_k=0.0)
-            smooth = np.array(
-                [
-                    step(law, state, load_n=newton)
-                    for law, state, newton in zip(laws, states, load.tolist(), strict=True)
-                ]
-            )
+            smooth = np.zeros(len(laws))
+            for pad in np.flatnonzero((load > 0) | loaded).tolist():  # an unloaded sheet doesn't change
+                smooth[pad] = step(laws[pad], states[pad], load_n=float(load[pad]))
+            loaded = load > 0
             flicker = 1 + noise_std / np.sqrt(np.maximum(smooth, 1e-3)) * rng.normal(size=len(laws))
             apparent = np.maximum(gains * press * smooth * flicker, 0.0)
             now = apparent > DETECTED_N
@@ -135,20 +149,20 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
                 compared[began] = False
             touching = now
             held.touching[:], held.uncompensated_force_n[:] = touching, apparent
+            held.uncompensated_std_n[:] = law_std * apparent
             compensation.compensate_forces(t_ns)
             due = np.flatnonzero(touching & ~compared & (load > 0) & (use.age_s >= use.sample_s))
             compared[due] = True
-            for pad in due.tolist():
-                force_n = compensation.force_n[pad] if is_modelled[pad] else apparent[pad]
-                std_n = compensation.std_n[pad] if is_modelled[pad] else np.nan
-                rows.append(
-                    {
-                        "error": force_n - load[pad], "std": std_n, "kind": kind[pad], "pad": pad,
-                        "hour": gone_s / HOUR_S, "age": use.age_s[pad], "force": load[pad],
-                        "valid": compensation.state[pad] == ForceReliability.RELIABLE,
-                        "uncompensated": apparent[pad] - load[pad],
-                    }
-                )  # fmt: skip
+            rows += [
+                {
+                    "error": compensation.force_n[pad] - load[pad], "std": compensation.std_n[pad],
+                    "kind": kind[pad], "pad": f"{seed}/{pad}",
+                    "hour": gone_s / HOUR_S, "age": use.age_s[pad], "force": load[pad],
+                    "valid": compensation.state[pad] == ForceReliability.RELIABLE,
+                    "uncompensated": apparent[pad] - load[pad],
+                }
+                for pad in due.tolist()
+            ]  # fmt: skip
     return _estimates(rows)
 
 

@@ -172,6 +172,31 @@ def test_standard_deviations_cover_a_long_hold_with_another_final_value() -> Non
     assert np.sqrt(np.mean(off**2)) > 0.33 * np.sqrt(np.mean(rig.compensation.std_n**2))
 
 
+def test_a_creep_that_was_described_may_end_later_than_described() -> None:
+    film = replace(
+        calm(sheet.S2),
+        adaptation=replace(sheet.S2.adaptation, share=0.0),
+        creep=sheet.Creep(0.7, (0.2, 0.1), (0.4, 30.0)),
+    )
+    described = Behaviour(
+        preset="S2", adaptation_share=0.0, creep_share=0.3, creep_time_s=0.6, press_std=0.0, gain_std=0.0
+    )
+    rig = Rig(1, film, sheet_behaviour_of(described))
+    rig.run(3.0, np.array([2.0]))
+    assert rig.compensation.force_n[0] < 2.0 - 0.1
+    assert rig.compensation.force_n[0] + 1.96 * rig.compensation.std_n[0] > 2.0
+
+
+def test_the_error_of_the_contact_law_counts_once() -> None:
+    rig = Rig(2, calm(sheet.S1), sheet_behaviour_of(Behaviour(gain_std=0.1, press_std=0.0)))
+    rig.run(2.0, np.full(2, 3.0))
+    rig.tick_state.uncompensated_std_n[:] = rig.apparent * [0.0, 0.1]
+    for _ in range(2):
+        rig.t_ns += PERIOD_NS
+        rig.compensation.compensate_forces(rig.t_ns)
+    assert rig.compensation.std_n[0] == pytest.approx(rig.compensation.std_n[1], rel=1e-6)
+
+
 def test_a_sheet_that_does_not_adapt_has_no_adapted_force_from_earlier_loads() -> None:
     behaviour = sheet_behaviour_of(Behaviour(adaptation_share=0.0, back_force_std_n=0.3))
     assert Rig(1, QUICK, behaviour).compensation.back_force[1][0] == 0

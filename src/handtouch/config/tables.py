@@ -246,7 +246,9 @@ class Behaviour(Table):
         None, description="relative spread between readings of equal presses (1 sigma)"
     )
     gain_std: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.05, description="relative error of forces on a fresh sheet, common to all presses (1 sigma)"
+        0.04,
+        description="relative error of forces on a fresh sheet, common to all presses (1 sigma), where that "
+        "of the contact law isn't larger; default: that of contact_ohm_std",
     )
     parameter_std_fraction: Annotated[float, Field(ge=0, le=1)] = Field(
         0.2, description="relative error of the parameters of creep, adaptation and hysteresis (1 sigma)"

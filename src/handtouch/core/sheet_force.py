@@ -300,8 +300,9 @@ class SheetForceCompensation:
             self.std_n[group.rows] = group.compensator.std_n()
         with np.errstate(all="ignore"):
             relative = self._held.uncompensated_std_n[pressed] / apparent_n[pressed]
-        variance = np.square(self.std_n[pressed]) + np.square(relative * force)
-        variance += np.square(force * self.log_gain_std[pressed])
+        # either includes the error of the contact law
+        common = np.maximum(relative, self.log_gain_std[pressed])
+        variance = np.square(self.std_n[pressed]) + np.square(force * common)
         std = np.sqrt(variance)
         self._relative_std[pressed] = std / np.maximum(force, _MIN_FORCE_N)
         enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
@@ -435,6 +436,7 @@ def sheet_behaviour_of(behaviour: Behaviour, material: str = "") -> SheetBehavio
         behaviour.parameter_std_fraction,
         behaviour.parameter_std_fraction,
         math.inf,
+        late_creep=behaviour.parameter_std_fraction * (behaviour.creep_share or 0.0),
     )
     return SheetBehaviour(
         model,

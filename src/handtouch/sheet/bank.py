@@ -62,7 +62,8 @@ _MIN_SLOPE = 0.02
 @dataclass(frozen=True)
 class BankPrior:
     """Prior of a bank. log_time_std: scale of the logarithm of adaptation's time over the preset's (Cauchy).
-    not_adapting: probability that the sheet doesn't adapt. exponent_std: of slow creep."""
+    not_adapting: probability that the sheet doesn't adapt. exponent_std: of slow creep, 0: known not to
+    creep."""
 
     log_time_std: float = 0.5
     not_adapting: float = 0.15
@@ -297,7 +298,7 @@ class ModelBank:
         move = np.clip(state.exponent[rows] + move, 0.0, _MAX_EXPONENT) - state.exponent[rows]
         state.exponent[rows] += move
         state.exponent_variance[rows] *= 1 - gain * ages * (steady + still) / likelihood
-        state.exponent_variance[rows] += _EXPONENT_WALK**2
+        state.exponent_variance[rows] += min(_EXPONENT_WALK, self._prior.exponent_std) ** 2
         found = _KEPT * state.log_weight[rows] + np.log(likelihood)
         found -= found.max(axis=1, keepdims=True)
         state.log_weight[rows] = np.maximum(found, _MIN_LOG_WEIGHT)

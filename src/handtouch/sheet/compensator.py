@@ -26,7 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 class ParameterUncertainty:
     """Standard deviations of a model's parameters.
 
-    creep, adaptation, hysteresis: as fractions of the correction made by each. forget_time_s: time constant
+    creep, adaptation, hysteresis: as fractions of the correction made by each. late_creep: of the load, that
+    a reading reaches later than the creep's times. forget_time_s: time constant
     with which an undetected press becomes likely; infinite if the back force is known. temperature_k: of the
     given temperature [K].
     """
@@ -36,6 +37,7 @@ class ParameterUncertainty:
     hysteresis: float = 0.2
     forget_time_s: float = 60.0
     temperature_k: float = 0.0
+    late_creep: float = 0.0
 
     @classmethod
     def exact(cls) -> ParameterUncertainty:
@@ -186,6 +188,7 @@ class SheetCompensator:
             back_std_n, growth_std = self.bank.spread(pads)
             variance += np.square(back_std_n) + np.square(growth_std * effective)
         variance += np.square(self.uncertainty.creep * (effective - reading))
+        variance += np.square(self.uncertainty.late_creep * effective)
         if len(self._plays):
             variance += np.square(self.uncertainty.hysteresis * (load - before))
         variance += fixed
