@@ -465,8 +465,8 @@ its link.""",
         "Slow presses": "On a pad of the shipped hand, begin_threshold_n 0.06 N, max_rise_time_s 20.",
         DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and of
 the paper's two, for {hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to
-{FULL_N:g} N, half of them waxing and waning, and breaks. The deployment file describes sheets as their builder would;
-contact layers differ as in the world. Contacts are given their load: errors of position, currents and
+{FULL_N:g} N, half of them waxing and waning, and breaks. The deployment file describes sheets as their
+builder would; contact layers differ as in the world. Contacts are given their load: errors of position, currents and
 radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the paper's are there exactly as in
 the file, one seed. One reading of each contact, at a random age. Errors rms of valid forces; *ratio*:
 compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation of the file instead of
