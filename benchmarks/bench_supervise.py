@@ -466,14 +466,14 @@ its link.""",
         DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and of
 the paper's two, for {hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to
 {FULL_N:g} N, half of them waxing and waning, and breaks. The deployment file describes sheets as their
-builder would; contact layers differ as in the world. Contacts are given their load: errors of position, currents and
-radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the paper's are there exactly as in
-the file, one seed. One reading of each contact, at a random age. Errors rms of valid forces; *ratio*:
-compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation of the file instead of
-learned ones, which is what handtouch compensated before it learned any. *In 95 %*: share of readings within
-the stated interval, with the 95 % interval of a binomial count; *by pad*: with that of the scatter between
-pads, as readings of one pad share gain and parameters. *Width* of the stated 95 % interval. *All* are the
-world's own kinds, also by age of the contact.""",
+builder would; contact layers differ as in the world. Contacts are given their load: errors of position,
+currents and radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the paper's are there
+exactly as in the file, one seed. One reading of each contact, at a random age. Errors rms of valid forces;
+*ratio*: compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation of the file
+instead of learned ones, which is what handtouch compensated before it learned any. *In 95 %*: share of
+readings within the stated interval, with the 95 % interval of a binomial count; *by pad*: with that of the
+scatter between pads, as readings of one pad share gain and parameters. *Width* of the stated 95 % interval.
+*All* are the world's own kinds, also by age of the contact.""",
         PARTS: "The first seed in `default`, its own kinds, without some parts; a third of the time.",
         "Cost": f"Medians in us; {machine}. Sheets: S1, half of the pads touched.",
     }
