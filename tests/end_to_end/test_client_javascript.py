@@ -107,13 +107,14 @@ def test_javascript_and_python_read_the_same_from_the_daemon(rig: Any, program: 
     try:
         reader.wait({"alive": True})
         python: dict[str, dict[int, Any]] = defaultdict(dict)
-        ends, services = 0, 0
+        contacts, ends, services = 0, 0, 0  # until the reader, which may be slower, has seen enough
         with connect(*PATTERNS, endpoint=endpoint, queue=100_000) as messages:
-            while ends < 2 or services < 4:
+            while contacts < 200 or ends < 2 or services < 4:
                 message = messages.recv(LONGEST_S)
                 assert message is not None, rig.all_printed()
                 if not message.retained:
                     python[wire.topic_of(message)][message.seq] = _plain(message)
+                contacts += isinstance(message, wire.Contact)
                 ends += isinstance(message, wire.Contact) and message.event == "end"
                 services += isinstance(message, wire.Service)
         summary = reader.end()
