@@ -128,6 +128,26 @@ def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(toleranc
         assert 0.84 < held[valid & slice_].mean() <= 1.0
 
 
+@pytest.mark.parametrize("greatest_n", [3.0, 5.0, 11.0, 20.0, 27.0])
+@pytest.mark.parametrize(
+    "tolerances",
+    ["contact_radius_std_mm = 0.5", WIDE, HERTZ],
+    ids=["default", "wide", "hertz"],
+)
+def test_no_current_gives_a_force_beyond_the_greatest_one(greatest_n: float, tolerances: str) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {greatest_n}")
+    text = text.replace("contact_radius_std_mm = 0.5", tolerances)
+    model = PadModel(parse(text))
+    fractions = model.networks[0].fractions(model.networks[0].a * 0.3, model.networks[0].b / 2)
+    force, std, status = solve_each(model, np.geomspace(1e-5, 0.1, 300)[:, None] * fractions).T
+    valid = status == ForceEstimateStatus.VALID
+    assert valid.sum() > 50
+    assert force[valid].max() <= greatest_n
+    assert std[valid].max() < greatest_n
+    bounds = force[status == ForceEstimateStatus.LOWER_BOUND]
+    assert bounds.size == 0 or bounds.max() <= greatest_n * (1 + 1e-9)
+
+
 def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(bench: Any) -> None:
     model = bench.model
     fractions = model.networks[0].fractions(model.networks[0].a / 2, model.networks[0].b / 2)

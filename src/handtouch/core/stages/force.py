@@ -188,8 +188,13 @@ def _find_end(stack: StackTable, law: PadLaw, log_spreading_m: float, resistors:
 def _find_likely(
     stack: StackTable, law: PadLaw, result: ForceResult, left: float, least: float, top: float
 ) -> float:
-    """Return ln x^2 of `left`, at most `top`; of a contact that grows by Newton steps on its logarithm."""
-    log_x2 = min(find_log_x2(stack, max(left - 0.5 * (result.high + result.low), least)), top)
+    """Return ln x^2 of `left`, at most `top`; of a contact that grows by Newton steps on its logarithm.
+
+    `least`: stack factor at `top`, whose inverse may be a little less than that.
+    """
+    log_x2, factor = top, left - 0.5 * (result.high + result.low)
+    if factor > least:
+        log_x2 = min(find_log_x2(stack, factor), top)
     if law.parameters[_GROWTH] > 0.0:
         for _ in range(_MAX_STEPS):
             _evaluate(stack, law, result, log_x2)
