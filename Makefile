@@ -104,13 +104,11 @@ socketcan: $(VENV)/.dev $(VENV)/.core ## run the tests on SocketCAN; skipped wit
 # --- measure: every benchmarks/{bench,soak,stress}_NAME.py; ONLY=NAME chooses one
 
 .PHONY: bench soak stress
-bench: ## run the benchmarks: errors, latency, load
+bench: ## run the benchmarks: errors, latency, load; an hour
 soak: ## run the endurance tests
 stress: ## run sweeps that are too slow for the tests
 bench soak stress: $(VENV)/.dev $(VENV)/.core
-	@set -e; for program in benchmarks/$@_$(ONLY).py; do \
-		test -e "$$program" || { echo "there is no $$program"; exit 1; }; \
-		echo "== $$program"; PYTHONPATH=. $(BIN)/python "$$program" $(ARGS); done
+	@PYTHONPATH=. $(BIN)/python benchmarks/run_programs.py $@ '$(ONLY)' $(ARGS)
 
 # --- maintain
 

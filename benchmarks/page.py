@@ -1,6 +1,7 @@
 """Options and pages of benchmarks, the stamp of what they measured, and their run times.
 
-Public names: `options`, `output_folder`, `table`, `made_by`, `progress`; for readers of a page `outdated`.
+Public names: `options`, `output_folder`, `table`, `made_by`, `progress`; `outdated` for readers of a page;
+`keep_run_time` and `measured_commit` for who runs several programs.
 
 A program that ends without an error notes how long it took in docs/benchmarks/run_times.json, and in the
 table at the end of docs/benchmarks/README.md.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import ast
 import atexit
+import fcntl
 import hashlib
 import json
 import os
@@ -79,6 +81,15 @@ def progress(done: object) -> None:
 def keep_run_time(folder: Path, name: str, entry: dict[str, Any]) -> None:
     """Write how long a program took into the folder's run_times.json and the README's table of all."""
     path, readme = folder / RUN_TIMES, folder / "README.md"
+    lock = os.open(folder, os.O_RDONLY)
+    fcntl.flock(lock, fcntl.LOCK_EX)  # programs may end at the same time
+    try:
+        _write_run_time(path, readme, name, entry)
+    finally:
+        os.close(lock)
+
+
+def _write_run_time(path: Path, readme: Path, name: str, entry: dict[str, Any]) -> None:
     known = json.loads(path.read_text()) if path.exists() else {}
     known[name] = entry
     path.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
@@ -89,8 +100,8 @@ def keep_run_time(folder: Path, name: str, entry: dict[str, Any]) -> None:
     all_bench = [row["minutes"] for program, row in known.items() if program.startswith("bench_")]
     note = (
         "Of the last full run of each program: wall time, processor time of all its processes, and the load "
-        f"average when it ended. The benchmarks listed here take {sum(all_bench):.0f} minutes one after the "
-        "other."
+        f"average when it ended. The benchmarks listed here take {sum(all_bench):.0f} minutes in sum; "
+        "`make bench` runs those that time nothing side by side."
     )
     before = readme.read_text().partition(RUN_TIMES_HEAD)[0].rstrip() if readme.exists() else ""
     readme.write_text("\n".join([f"{before}\n\n{RUN_TIMES_HEAD}", *textwrap.wrap(note, 110), "", *lines, ""]))
@@ -105,7 +116,7 @@ def _note_run_time(folder: Path, name: str, process: int) -> None:
         "minutes": (time.monotonic() - _BEGAN_S) / 60,
         "cpu_minutes": sum(usage.ru_utime + usage.ru_stime for usage in used) / 60,
         "load": os.getloadavg()[0],
-        "commit": _commit(),
+        "commit": measured_commit(),
     }
     keep_run_time(folder, name, entry)
 
@@ -114,7 +125,8 @@ def made_by() -> str:
     """Return the stamp of the running program: its name, commit and source digest."""
     program = _program()
     kind, _, name = program.stem.partition("_")
-    return f"Made by `make {kind} ONLY={name}` at commit `{_commit()}`, source `{source_digest(program)}`"
+    commit, source = measured_commit(), source_digest(program)
+    return f"Made by `make {kind} ONLY={name}` at commit `{commit}`, source `{source}`"
 
 
 def outdated(text: str) -> str:
@@ -140,7 +152,7 @@ def forget_files() -> None:
 def source_digest(program: Path) -> str:
     """Return a digest of the code that a program imports at any depth, from src and benchmarks, and its own.
 
-    Comments, docstrings and layout don't count.
+    Comments, docstrings and layout don't count, nor does this module, which measures nothing.
     """
     digest, waiting, seen = hashlib.sha256(), [program], {program}
     while waiting:
@@ -148,7 +160,7 @@ def source_digest(program: Path) -> str:
             if path not in seen:
                 seen.add(path)
                 waiting.append(path)
-    for path in sorted(seen):
+    for path in sorted(seen - {Path(__file__)}):
         digest.update(f"{path.relative_to(ROOT)} {_code_digest(path)}\n".encode())
     return digest.hexdigest()[:12]
 
@@ -157,7 +169,8 @@ def _program() -> Path:
     return Path(str(sys.modules["__main__"].__file__)).resolve()
 
 
-def _commit() -> str:
+def measured_commit() -> str:
+    """Return the checked-out commit, with a note if the code was changed since; `unknown` without git."""
     git = ("git", "-C", str(ROOT))
     try:
         commit = subprocess.run(
