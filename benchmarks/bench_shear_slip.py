@@ -19,7 +19,7 @@ import numpy as np
 from bench_percept_grasp import ALARMS, STATED, slips, together
 from grasp_run import Served, drawn_world, served
 from numpy.typing import NDArray
-from scores import Estimates, EstimateScore, bin_labels, concatenate, slices
+from scores import Estimates, EstimateScore, Rate, Share, bin_labels, concatenate, slices
 
 from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
@@ -87,13 +87,14 @@ def slip_row(world: str, name: str, runs: Sequence[Served], on: Sequence[str]) -
         "world": world,
         "alarms by": name,
         "slips": found["slips"],
-        "detected": found["detected"],
+        "detected, %": str(Share(found["detected"], found["slips"])),
         "delay, ms, 50 %": found["ms"],
         "delay, ms, 95 %": found["ms_95"],
         "before the onset, %": float(100 * before.mean()) if len(before) else np.nan,
         "grip, min": found["minutes"],
         "false": found["false"],
-        "false per min": found["false_per_minute"],
+        "false per min": str(Rate(found["false"], found["minutes"])),
+        "others": found["between"],
     }
 
 
@@ -140,7 +141,8 @@ def main() -> None:
             "Onsets of slips, firm grips and false alarms are defined as in [percepts of "
             "grasps](percept_grasp.md), "
             f"but alarms from {1e3 * LEAD_S:.0f} ms before an onset on are of it. Delays are those of "
-            "detected slips, negative before the onset; joints are known to 0.2 degrees.",
+            "detected slips, negative before the onset; joints are known to 0.2 degrees. *Others*: alarms "
+            "during motion slower than a slip, or while a grip closes.",
             slip_rows,
         ),
         *table(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from handtouch.percept.friction import FrictionLimit, FrictionMonitor
+from handtouch.percept.friction import PRIOR_LIMIT, FrictionLimit, FrictionMonitor
 from handtouch.percept.pipeline import PerceptPipeline
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 from handtouch.wire import PERCEPT_KINDS
@@ -33,7 +33,7 @@ def pulled(monitor: FrictionMonitor, limit: float, rate_per_s: float, pad: int =
 
 def test_sticking_raises_the_bound_and_a_slip_states_the_limit() -> None:
     limit = FrictionLimit()
-    assert limit.probability_below(0.8) == pytest.approx(0.5, abs=1e-6)
+    assert limit.probability_below(PRIOR_LIMIT) == pytest.approx(0.5, abs=1e-6)
     stuck = limit.after_sticking(0.7)
     assert stuck.probability_below(0.7) == 0
     assert 0 < stuck.probability_below(0.8) < limit.probability_below(0.8)
@@ -55,10 +55,10 @@ def test_a_noisy_ratio_is_less_certain_to_be_below_the_limit() -> None:
     assert limit.probability_below(0.4, 0.5) > 2 * limit.probability_below(0.4)
 
 
-@pytest.mark.parametrize("limit", [0.45, 0.6, 1.1])
+@pytest.mark.parametrize("limit", [0.35, 0.45, 0.6, 0.9, 1.3])
 def test_after_slips_of_an_object_the_next_is_announced_before_it_begins(limit: float) -> None:
     monitor = FrictionMonitor()
-    for _ in range(4):
+    for _ in range(6):
         pulled(monitor, limit, 2.0)
     lead_s = pulled(monitor, limit, 2.0, pad=1)
     assert lead_s is not None
@@ -84,7 +84,29 @@ def test_a_steady_grip_far_below_the_limit_raises_no_alarm() -> None:
         assert state.label == "sticking"
     assert state is not None
     assert state.ratio == pytest.approx(0.4, abs=0.03)
-    assert state.margin == pytest.approx(1 - 0.4 / 0.8, abs=0.06)
+    assert state.margin == pytest.approx(1 - 0.4 / PRIOR_LIMIT, abs=0.06)
+
+
+def test_a_ratio_that_fluctuates_at_the_limit_raises_one_alarm() -> None:
+    monitor, rng, raised, alarmed = FrictionMonitor(), np.random.default_rng(1), 0, False
+    for k in range(100):
+        ratio = 1.0 + 0.15 * rng.standard_normal()
+        state = monitor.update(0, 0.005 * k, (2.0 * ratio, STD_N), NORMAL)
+        assert state is not None
+        raised += state.label == "incipient" and not alarmed
+        alarmed = state.label == "incipient"
+    assert raised == 1
+
+
+@pytest.mark.parametrize(("tangential_std_n", "normal_std_n"), [(0.6, 0.1), (0.02, 0.6)])
+def test_errors_of_either_force_make_an_alarm_less_probable(
+    tangential_std_n: float, normal_std_n: float
+) -> None:
+    exact = FrictionMonitor().update(0, 0.0, (2.4, STD_N), NORMAL)
+    rough = FrictionMonitor().update(0, 0.0, (2.4, tangential_std_n), (2.0, normal_std_n))
+    assert exact is not None
+    assert rough is not None
+    assert 0.5 < rough.probability < exact.probability
 
 
 def test_the_ratio_has_the_error_of_both_forces() -> None:

@@ -14,21 +14,22 @@ from dataclasses import dataclass, replace
 
 from scipy.special import log_ndtr
 
-PRIOR_LIMIT, PRIOR_LOG_STD = 0.8, 0.35
+PRIOR_LIMIT, PRIOR_LOG_STD = 0.95, 0.35
 """Limit of friction before anything is known, with the standard deviation of its logarithm: objects differ by
 that, and so do pads."""
 _SLIP_LOG_STD = 0.4  # of one observed slip: pads and spots differ, and slips are observed late
-_MIN_LOG_STD = 0.25
+_MIN_LOG_STD = 0.1
 _MIN_SLIP_PROBABILITY = (
-    0.01  # of a limit below an observed slip's ratio; a rarer slip was none: the pad rolled
+    0.003  # of a limit below an observed slip's ratio; a rarer slip was none: the pad rolled
 )
 _SLIP_SPAN_S = 0.1  # before a slip is observed, in which the greatest ratio was the limit
-_STICK_LOG_STD = 0.05  # noise of the ratio of a contact that sticks
+_STICK_LOG_STD = 0.1  # noise of the ratio of a contact that sticks
 _RATE_TIME_S = 0.02  # smoothing of the ratio's rate
-_HORIZON_S = 0.02
+_HORIZON_S = 0.05
 _MIN_NORMAL_SIGMA = 1.5  # normal force in its standard deviations, below which there is no ratio
 _STICK_S = 0.1  # a ratio that a contact held for so long stuck; a faster rise teaches nothing yet
-_ALARM, _CLEAR = 0.25, 0.12  # probability of incipient slip that raises and clears it
+_ALARM, _CLEAR = 0.6, 0.3  # probability of incipient slip that raises and clears it
+_MIN_ALARM_S = 0.05  # a ratio that fluctuates at the limit is one alarm
 _MAX_GAP_S = 0.1
 _MAX_RELATIVE_STD = 1.0
 
@@ -81,7 +82,7 @@ class FrictionState:
     """Friction of one contact at one sample.
 
     ratio, ratio_std: tangential over normal force. rate_per_s: of the ratio. margin: 1 - ratio / limit, below
-    0 beyond the mean limit. probability: that the limit is reached within 20 ms at this rate. label:
+    0 beyond the mean limit. probability: that the limit is reached within 50 ms at this rate. label:
     "sticking" or "incipient".
     """
 
@@ -101,6 +102,8 @@ class _Contact:
     ratio: float
     rate: float = 0.0
     alarmed: bool = False
+    alarm_s: float = -math.inf
+    """last sample with a probability that raises an alarm or keeps it"""
     slips: bool = False
     held_since_s: float = math.nan
     held: float = math.nan
@@ -154,9 +157,10 @@ class FrictionMonitor:
         if ratio >= contact.peak or t_s - contact.peak_s > _SLIP_SPAN_S:
             contact.peak_s, contact.peak = t_s, ratio
         ahead = ratio + _HORIZON_S * max(contact.rate, 0.0)
-        # the normal force's error is mostly the pad's, and so in the limit too
-        probability = self.limit.probability_below(ahead, size_std_n / size_n if size_n > 0 else 0.0)
-        contact.alarmed = probability > (_CLEAR if contact.alarmed else _ALARM)
+        probability = self.limit.probability_below(ahead, spread / ratio if ratio > 0 else 0.0)
+        if probability > (_CLEAR if contact.alarmed else _ALARM):
+            contact.alarm_s = t_s
+        contact.alarmed = t_s - contact.alarm_s < _MIN_ALARM_S
         if slips and not contact.slips and contact.peak > 0:
             self.limit = self.limit.after_slip(contact.peak)
         contact.slips = slips
