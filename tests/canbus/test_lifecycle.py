@@ -54,7 +54,7 @@ def life(state: NodeState, **changes: object) -> Lifecycle:
         identified=state not in (A, B),
         confirmed=state in (O, T),
     )
-    return replace(usual, **changes)  # type: ignore[arg-type]  # whatever fields a test names
+    return usual._replace(**changes)  # type: ignore[arg-type]  # whatever fields a test names
 
 
 def failed(step: NodeAction, **changes: object) -> StepFailed:

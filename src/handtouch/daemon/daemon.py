@@ -63,8 +63,8 @@ from handtouch.host.process import process_statistics
 
 _log = logging.getLogger("handtouch.daemon")
 
-_BACKGROUND_PERIOD_NS = 4_000_000
-"""Least period of polling nodes, buses, health and requests, which is longer than a tick's at high rates"""
+_BACKGROUND_PERIOD_NS = 9_000_000
+"""Least period of polling nodes, buses, health and requests; two ticks at 200 Hz, more at higher rates"""
 _LOGGED_PAUSE_NS = 100_000_000
 _MESSAGE_PATH_THREADS = 3
 """Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""

@@ -36,6 +36,9 @@ from handtouch.core.stages.receive import frame_arrival_ns
 
 _SO_TIMESTAMPNS, _SO_MEMINFO = 35, 55
 _MEMINFO_DROPS_INDEX = 8  # of 32-bit words
+_DROPPED_PERIOD_NS = 50_000_000
+_DROPPED_FRAMES = 32
+"""Dropped frames are counted that often, and whenever so many were waiting: only a full queue drops any."""
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _TIMESPEC = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size)
@@ -57,6 +60,7 @@ class _SocketReceiver:
         self._newest_ns = self._failure_ns = 0  # arrival of the newest frame, and the last failure
         self._bus: can.BusABC | None = None
         self._dropped = 0
+        self._dropped_checked_ns = 0
         self._emptied_ns = 0  # begin of the last `drain` that emptied the queue
 
     def open(self) -> Self:
@@ -86,7 +90,9 @@ class _SocketReceiver:
         before = router.counters.frames
         try:
             self._receive(bus, router, others)
-            self._count_dropped(router)
+            waited_ns = self._emptied_ns - self._dropped_checked_ns
+            if waited_ns > _DROPPED_PERIOD_NS or router.counters.frames - before >= _DROPPED_FRAMES:
+                self._count_dropped(router)
             failure = None
         except Exception as error:  # noqa: BLE001 - drivers raise anything on bad input; it is counted here
             failure = error
@@ -157,6 +163,7 @@ class _SocketReceiver:
 
     def _count_dropped(self, router: Router) -> None:
         """Count the frames that the kernel has dropped for this socket since the last call."""
+        self._dropped_checked_ns = self._emptied_ns
         total = _dropped_frames(self._socket)
         if total != self._dropped:
             router.counters.overflow += total - self._dropped & 0xFFFFFFFF

