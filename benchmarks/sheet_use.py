@@ -1,7 +1,8 @@
 """Forces of sheets in hours of mixed use: the daemon's compensation against the worlds' sheets.
 
-Public names: `Sheets`, `drawn_sheets`, `score_use`. True loads go through the simulator's sheet laws,
-apparent ones through the compensation; one reading of each contact is compared, at a random age.
+Public names: `Sheets`, `drawn_sheets`, `score_use`; `Use` and `Holds`, kinds of use. True loads go through
+the simulator's sheet laws, apparent ones through the compensation; one reading of each contact is compared,
+at a random age.
 """
 
 from __future__ import annotations
@@ -106,10 +107,28 @@ class Use:
         return np.asarray(np.minimum(self._force * wave, FULL_N))
 
 
-def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
+class Holds(Use):
+    """The same object held again and again, compared at the end of each hold."""
+
+    HELD_N, HELD_S, PAUSE_S = 2.0, 300.0, 6.0
+
+    def spells(self, hours: float) -> Iterator[tuple[float, bool]]:
+        """Yield one spell of work."""
+        yield DT_S * round(hours * HOUR_S / DT_S), True
+
+    def loads_n(self) -> FloatArray:
+        """Return true loads (n,) of the next step."""
+        self.age_s += DT_S
+        self.age_s[self.age_s > self.HELD_S + self.PAUSE_S] = DT_S
+        self.sample_s[:] = self.HELD_S - 2 * DT_S
+        return np.where(self.age_s <= self.HELD_S, self.HELD_N, 0.0)
+
+
+def score_use(sheets: Sequence[Sheets], hours: float, seed: int, kind_of_use: type[Use] = Use) -> Estimates:
     """Return force errors [N] of one reading of each contact.
 
-    Columns: `kind`, `pad`, `hour`, `age`, `uncompensated` (error without compensation). There is no bound.
+    Columns: `kind`, `pad`, `hour`, `age`, `load` [N], `uncompensated` (error without compensation). There is
+    no bound.
     """
     rng = np.random.default_rng((seed, 9))
     laws = [law for some in sheets for law in some.laws]
@@ -120,7 +139,7 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int) -> Estimates:
     gains = np.concatenate([some.gains for some in sheets])
     law_std = np.repeat([some.law_std for some in sheets], [len(some.laws) for some in sheets])
     kind = np.repeat([some.name for some in sheets], [len(some.laws) for some in sheets])
-    use = Use(len(laws), rng)
+    use = kind_of_use(len(laws), rng)
     compared, press = np.zeros(len(laws), np.bool_), np.ones(len(laws))
     press_std = np.array([law.press_std for law in laws])
     noise_std = np.array([law.noise_std for law in laws])
@@ -179,8 +198,9 @@ def _estimates(rows: Sequence[dict[str, Any]]) -> Estimates:
             "kind": column["kind"],
             "pad": column["pad"],
             "hour": column["hour"],
-            "age": bin_labels(column["age"], (1.0, 10.0), "s"),
+            "age": bin_labels(column["age"], (1.0, 10.0, 60.0), "s"),
             "force": bin_labels(column["force"], (0.5, 2.0), "N"),
             "uncompensated": column["uncompensated"],
+            "load": column["force"],
         },
     )

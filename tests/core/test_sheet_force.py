@@ -292,3 +292,32 @@ def test_the_keys_of_a_behaviour_change_its_preset() -> None:
     assert made.model.creep.times_s == ()
     assert made.model.hysteresis.widths_n
     assert made.uncertainty.creep == 0.1
+
+
+def test_intervals_of_an_unknown_sheet_are_wide_and_narrow_with_holds_and_force_references() -> None:
+    """On a sheet that neither adapts nor creeps, and reads 15 % too high."""
+    settled = sheet.SheetModel(replace(sheet.UNKNOWN.adaptation, share=0.0))
+    unknown = Rig(1, settled, sheet_behaviour_of(Behaviour(preset="unknown")))
+    measured = Rig(1, settled, sheet_behaviour_of(Behaviour(preset="S1")))
+    true, read = 2.0, np.array([2.3])
+
+    def hold(rig: Rig, seconds: float) -> float:
+        """Return the standard deviation during a hold, and release."""
+        rig.run(seconds, read)
+        std = float(rig.compensation.std_n[0])
+        assert rig is measured or abs(rig.compensation.force_n[0] - true) < 1.96 * std
+        rig.run(2.0, 0 * read)
+        return std
+
+    first = hold(unknown, 4.0)
+    assert first > 1.7 * hold(measured, 4.0)
+    for _ in range(3):
+        hold(unknown, 400.0)
+    assert unknown.compensation.adaptation_rejected[0]
+    used = hold(unknown, 4.0)
+    assert used < first
+    for _ in range(30):
+        unknown.run(2.0, read)
+        reference = ForceReference(np.array([0]), np.array([true]), np.array([0.02]), unknown.t_ns)
+        unknown.compensation.update_gains(reference, np.array([unknown.t_ns]), unknown.touching)
+    assert hold(unknown, 4.0) < 0.8 * used

@@ -245,10 +245,11 @@ class Behaviour(Table):
     press_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None, description="relative spread between readings of equal presses (1 sigma)"
     )
-    gain_std: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.04,
+    gain_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
+        None,
         description="relative error of forces on a fresh sheet, common to all presses (1 sigma), where that "
-        "of the contact law isn't larger; default: that of contact_ohm_std",
+        "of the contact law isn't larger; default: 0.04, that of contact_ohm_std; of an unknown sheet 0.15, "
+        "as its hysteresis isn't known",
     )
     parameter_std_fraction: Annotated[float, Field(ge=0, le=1)] = Field(
         0.2, description="relative error of the parameters of creep, adaptation and hysteresis (1 sigma)"

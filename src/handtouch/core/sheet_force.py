@@ -31,6 +31,8 @@ _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
 _MAX_FORCE_STD_FRACTION = 1.0  # of the force: above it, the force is invalid
+_GAIN_STD, _UNKNOWN_GAIN_STD = 0.04, 0.15
+"""Of sheets that were measured, by contact_ohm_std / alpha; of one that wasn't: its loops, too."""
 _HOUR_S = 3600.0
 _LOG_GAIN_STD_PER_HOUR = 0.05
 _MAX_LOG_GAIN_RATE_PER_S = 0.02
@@ -441,12 +443,19 @@ def sheet_behaviour_of(behaviour: Behaviour, material: str = "") -> SheetBehavio
     return SheetBehaviour(
         model,
         uncertainty,
-        behaviour.gain_std,
+        _gain_std_of(behaviour),
         behaviour.back_force_std_n * float(np.max(model.adaptation.share)),
         behaviour.forget_time_s,
         _prior_of(behaviour),
         material,
     )
+
+
+def _gain_std_of(behaviour: Behaviour) -> float:
+    """Return the relative error of forces on a fresh sheet that is common to all presses."""
+    if behaviour.gain_std is not None:
+        return behaviour.gain_std
+    return _UNKNOWN_GAIN_STD if behaviour.preset == "unknown" else _GAIN_STD
 
 
 def _prior_of(behaviour: Behaviour) -> sheet.BankPrior:
