@@ -45,7 +45,7 @@ PADS, SEEDS = 8, (31, 32)
 """Sheets of each kind, and seeds of worlds and use."""
 HOLDS = (1, 2, 4, 8)
 """Numbers of the holds that are compared on sheets that weren't measured."""
-DAY, PARTS = "A day of mixed use of sheets", "Effect of the parts"
+DAY, PARTS = "Mixed use of sheets", "Effect of the parts"
 UNKNOWN = "Sheets that weren't measured"
 WARM, TURNED = "A hand that gets warm", "A hand that is turned over"
 INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"

@@ -87,11 +87,11 @@ def episode(name: str, seed: int, world: World) -> Episode:
     rng = np.random.default_rng((seed, sum(name.encode())))
     link = PADS[int(rng.integers(len(PADS)))]
     begin_s = float(rng.uniform(15, 30))
-    play = _Play(rng)
+    play = Play(rng)
     faults: list[Fault] = []
     details: dict[str, Any] = {}
     if name in FAULTY and name != "hysteresis tail":
-        details = _fault(name, rng, _size_mm(link))
+        details = draw_fault(name, rng, _size_mm(link))
         kind = details.pop("kind")
         faults.append(FAULTS[kind].model_validate({"kind": kind, "link": link, "from_s": begin_s, **details}))
         for pad in PADS:
@@ -122,7 +122,7 @@ def episode(name: str, seed: int, world: World) -> Episode:
     return Episode(name, seed, link, begin_s, details, described, hand)
 
 
-class _Play:
+class Play:
     """Touches of an episode, as they come to be."""
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -245,7 +245,7 @@ def _size_mm(link: str) -> tuple[float, float]:
     return 1e3 * u, 1e3 * v
 
 
-def _fault(name: str, rng: np.random.Generator, size_mm: tuple[float, float]) -> dict[str, Any]:
+def draw_fault(name: str, rng: np.random.Generator, size_mm: tuple[float, float]) -> dict[str, Any]:
     """Return a fault of that name, of a size that needs attention."""
     electrode = ELECTRODES[int(rng.integers(4))]
     place = tuple(rng.uniform(0.12, 0.88, 2).tolist())
