@@ -242,7 +242,7 @@ NOTES = {
     "opposite electrodes of pads with series resistors. Both read the same there, which is no evidence that "
     "they are shorted.",
     "Mended faults": f"Faults that end {MENDED_S:g} s after they began, in use for up to 6 more minutes. "
-    "Those of single channels and static loads end by themselves, those that contacts show after 20 contacts.",
+    "Those of single channels and static loads end by themselves, those of contacts after 20 of them.",
     "Reliability of the stated confidence": "All diagnoses above, `unexplained` aside; right: a fault that "
     "was played, on its pad, after it began.",
 }
