@@ -148,6 +148,25 @@ def test_no_current_gives_a_force_beyond_the_greatest_one(greatest_n: float, tol
     assert bounds.size == 0 or bounds.max() <= greatest_n * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("greatest", ["", "max_force_n = 5.0", "max_force_n = 12.0"])
+@pytest.mark.parametrize("corner", [(0.002, 0.002), (0.998, 0.003), (0.001, 0.995)])
+def test_no_force_is_valid_that_its_current_leaves_open_as_in_a_corner(
+    greatest: str, corner: tuple[float, float]
+) -> None:
+    model = PadModel(parse(TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\n{greatest}")))
+    side_a, side_b = model.networks[0].a, model.networks[0].b
+    currents = np.geomspace(1e-5, 2e-3, 60)[:, None]
+    force, std, status = solve_each(
+        model, currents * model.networks[0].fractions(corner[0] * side_a, corner[1] * side_b)
+    ).T
+    valid, wide = status == ForceEstimateStatus.VALID, status == ForceEstimateStatus.WIDE
+    assert valid.sum() > 20
+    assert (std[valid] < 8 * force[valid]).all()
+    assert (std[wide] > 1.2 * force[wide]).all()
+    inside = solve_each(model, currents * model.networks[0].fractions(0.5 * side_a, 0.5 * side_b))
+    assert not (inside[:, 2] == ForceEstimateStatus.WIDE).any()
+
+
 def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(bench: Any) -> None:
     model = bench.model
     fractions = model.networks[0].fractions(model.networks[0].a / 2, model.networks[0].b / 2)

@@ -71,9 +71,12 @@ class ForceEstimateStatus(IntEnum):
     LOWER_BOUND = 1  # the sheet is at its limit: force_n is a lower bound (2 sigma), std_n infinite
     BELOW_THRESHOLD = 2  # within the noise, or below the threshold of useful response
     INVALID = 3  # an input was NaN, or no contact carries such a current
+    WIDE = (
+        4  # of the daemon: the current leaves the force open within a factor of three or more, as in corners
+    )
 
 
-_VALID, _LOWER_BOUND, _BELOW_THRESHOLD, _INVALID = map(
+_VALID, _LOWER_BOUND, _BELOW_THRESHOLD, _INVALID, _ = map(
     np.uint8, ForceEstimateStatus
 )  # looking up a member takes a microsecond
 

@@ -20,7 +20,7 @@ import math
 
 from handtouch.field import contact_law
 
-_VALID, _LOWER_BOUND, _NOT_ESTIMATED = 0, 1, 2  # of a result's status
+_VALID, _LOWER_BOUND, _NOT_ESTIMATED, _WIDE = 0, 1, 2, 4  # ForceEstimateStatus, of a result
 _LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
 _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH = 5, 6, 7, 8, 14, 15, 16
 LAW_PARAMETERS = 17
@@ -30,6 +30,8 @@ _MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
 _TWO_PI, _INFINITY, _NAN = 2.0 * math.pi, math.inf, float("nan")
 _MAX_SIGMA = 3.3  # of the quadrature over the stack factor
 _MIN_RELATIVE_VARIANCE = 1e-18
+_MAX_SPREAD = 4.0
+"""Mean times mean inverse of a force from which on its estimate is WIDE: open by a factor of three"""
 _UNLIMITED_SIGMA = 3.0
 _MAX_LOG_FORCE = 300.0
 _MAX_STEPS, _CONVERGED_SIGMA = 12, 0.1
@@ -231,7 +233,7 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
         unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
         result.force_n = unit * force
         result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
-        result.status = _VALID
+        result.status = _VALID if mean * inverse < _MAX_SPREAD * weights * weights else _WIDE
 
 
 def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float) -> None:

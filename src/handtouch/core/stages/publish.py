@@ -24,7 +24,7 @@ in this order, each (n, values)."""
 _POSITION, _FORCE = VALUE_SLICES["position_m"].start, VALUE_SLICES["force_n"].start
 _FORCE_STD, _ESTIMATE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["force_status"].start
 _MISFIT, _MAX_SQUARED_MISFIT = VALUE_SLICES["squared_misfit"].start, MAX_SQUARED_MISFIT
-_LOWER_BOUND_ESTIMATE = 1.0  # ForceEstimateStatus
+_LOWER_BOUND_ESTIMATE, _WIDE_ESTIMATE = 1.0, 4.0  # ForceEstimateStatus
 _NAN, _INFINITY = float("nan"), float("inf")
 _NOT_COMPUTED = 0  # PositionStatus, ForceStatus
 _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = 1, 2, 3
@@ -154,6 +154,8 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
         elif values[first + _ESTIMATE] == _LOWER_BOUND_ESTIMATE:
             force = _FORCE_LOWER_BOUND
         elif not columns.known[pad] or columns.reliability[pad] == _EVIDENCE_MISSING:
+            force = _FORCE_UNRELIABLE
+        if force == _FORCE_VALID and values[first + _ESTIMATE] == _WIDE_ESTIMATE:
             force = _FORCE_UNRELIABLE
     columns.force_status[pad] = force
     if value == value and not columns.peak_force_n[pad] >= value:
