@@ -147,6 +147,14 @@ def test_force_covariance_has_each_stated_part() -> None:
     np.testing.assert_allclose(loop.covariance_n2[0], 0.03 * np.eye(2))
 
 
+def test_calibration_measures_the_loop_of_the_pad_by_what_remains_of_loads() -> None:
+    force = np.array([[2.0, -2.0, 0.0, 0.0], [0.0, 0.0, 1.5, -1.5]])
+    moved = force / 1e4
+    layer = calibrate_layer(moved, force, force_std=0.01, released_m=0.03 * moved)
+    assert layer.hysteresis == pytest.approx(0.03)
+    assert layer.axis_std == pytest.approx(0.03 / 2 / np.sqrt(3) / np.sqrt(2), rel=1e-6)
+
+
 def test_calibration_finds_the_stiffness_of_each_axis_from_loads_in_both_directions() -> None:
     force = np.array([[2.0, -2.0, 0.0, 0.0], [0.0, 0.0, 1.5, -1.5]])
     moved = force / np.array([[1.2e4], [0.9e4]])
@@ -155,5 +163,6 @@ def test_calibration_finds_the_stiffness_of_each_axis_from_loads_in_both_directi
     np.testing.assert_allclose(layer.stiffness_n_per_m, [1.2e4, 0.9e4], rtol=1e-12)
     assert layer.stiffness_std == 0.01
     assert 0.01 < layer.axis_std < 0.03
+    assert layer.hysteresis == 0.05
     with pytest.raises(ValueError, match="two loads"):
         calibrate_layer(moved[:, :3], force[:, :3], force_std=0.01)

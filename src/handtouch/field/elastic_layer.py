@@ -73,12 +73,15 @@ def calibrate_layer(
     force_std: float,
     hysteresis: float = 0.05,
     zero_std_n: float = 0.01,
+    released_m: npt.ArrayLike | None = None,
 ) -> ElasticLayer:
     """Return the layer that explains displacements (2, n) under known tangential forces (2, n).
 
     Least squares of displacement over force for each axis. force_std: relative error of the references,
-    common to all. axis_std is that of the fit, from its scatter and at least from the loop's width. Raises
-    ValueError unless each axis has two loads or more.
+    common to all. axis_std is that of the fit, from its scatter and at least from the loop's width at its
+    greatest force. released_m: displacements (2, n) after each load was taken off, which are the half-width
+    of the pad's own loop; else `hysteresis` is kept. Raises ValueError unless each axis has two loads or
+    more.
     """
     moved, force = np.asarray(displacements_m, np.float64), np.asarray(forces_n, np.float64)
     size = np.abs(force)
@@ -87,9 +90,12 @@ def calibrate_layer(
         raise ValueError("each axis needs two loads or more, best in both directions")
     weight = np.where(used, force, 0.0)
     compliance = (moved * weight).sum(axis=1) / (force * weight).sum(axis=1)
+    if released_m is not None:
+        left_n = np.asarray(released_m, np.float64) / compliance[:, None]
+        hysteresis = float(np.sqrt(np.mean((left_n**2).sum(axis=0) / (force**2).sum(axis=0))))
     off = np.where(used, moved / compliance[:, None] - force, 0.0)
     spread = np.sqrt((off**2).sum(axis=1) / (used.sum(axis=1) - 1))
-    loop = hysteresis * size.max(axis=1) / np.sqrt(3)
+    loop = hysteresis * size.max(axis=1) / 2 / np.sqrt(3)
     axis_std = np.maximum(spread, loop) / np.sqrt((weight**2).sum(axis=1))
     x, y = (1 / compliance).tolist()
     return ElasticLayer((x, y), force_std, float(axis_std.max()), hysteresis, zero_std_n)

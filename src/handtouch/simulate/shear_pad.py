@@ -24,7 +24,9 @@ _MM = 1e-3
 _TABLE_NODES = 7
 _OUTER = 2.3  # of the overlap: width of an electrode
 _WIDE = 8.0  # thicknesses of the film: an overlap whose edges don't see each other
-_PLAY_SHARES = 3.0 ** -np.arange(1, 6)  # radii of plays over the force at half the travel
+_SHEAR_MODULUS_PA = 2e5
+_SHEAR = 0.1  # of the layer, at which its stiffening is stated
+_PLAY_SHARES = 3.0 ** -np.arange(1, 6)  # radii of plays over the force at this shear
 _CREEP_S = 5.0
 _POINTS = (np.arange(7) + 0.5) / 7 - 0.5  # along an edge
 _ARC = 400
@@ -33,14 +35,16 @@ _ARC = 400
 class LayerHistory:
     """Displacement of the elastic layer of one pad under a changing force, with hysteresis and creep.
 
-    Vector plays of five sizes give loops about in proportion to their force.
+    Vector plays of five sizes give loops about in proportion to their force. The layer is silicone of
+    0.2 MPa, whose thickness follows from its stiffness; it is the same under any pattern of electrodes.
     """
 
     def __init__(self, shear: Shear, hidden: HiddenShear) -> None:
         stiffness = np.array(shear.stiffness_n_per_mm) / _MM
         self._stiffness = stiffness * hidden.stiffness_ratio * np.array(hidden.axis_ratio)
-        self._half_travel_m = _travel_m(shear) / 2
-        self._radii = _PLAY_SHARES * float(stiffness.mean()) * self._half_travel_m
+        thickness_m = _SHEAR_MODULUS_PA * (shear.plate_mm * _MM) ** 2 / float(stiffness.mean())
+        self._sheared_m = _SHEAR * thickness_m
+        self._radii = _PLAY_SHARES * float(stiffness.mean()) * self._sheared_m
         self._hidden = hidden
         self._plays = np.zeros((len(self._radii), 2))
         self._crept = np.zeros(2)
@@ -55,7 +59,7 @@ class LayerHistory:
         share = hidden.hysteresis
         carried = (1 - share * len(self._radii)) * force_n + share * self._plays.sum(axis=0)
         elastic = carried / self._stiffness
-        elastic = elastic / (1 + hidden.stiffening * float(elastic @ elastic) / self._half_travel_m**2)
+        elastic = elastic / (1 + hidden.stiffening * float(elastic @ elastic) / self._sheared_m**2)
         settled = -math.expm1(-elapsed_s / _CREEP_S)
         self._crept += settled * (hidden.creep * elastic - self._crept)
         moved: FloatArray = elastic + self._crept
@@ -226,13 +230,6 @@ class SimulatedShearPad:
         table = CubicSpline(np.linspace(-0.3, 2.3, 2 * _TABLE_NODES) * overlap, current)
         values = [table(nodes + overlap + edge * _MM) for edge in self.hidden.edge_offset_mm]
         return tuple(CubicSpline(nodes, value) for value in values)
-
-
-def _travel_m(shear: Shear) -> float:
-    pattern = shear.pattern
-    if isinstance(pattern, Discs):
-        return (pattern.radius_mm - pattern.gap_mm) * _MM
-    return pattern.overlap_mm * _MM
 
 
 @lru_cache(maxsize=512)

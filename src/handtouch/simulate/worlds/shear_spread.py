@@ -43,11 +43,12 @@ class ShearSpread:
     alpha_offset: Distribution = _ZERO
     """Exponent of the film's law."""
     hysteresis: Distribution = _ZERO
-    """Half-width of the layer's loop over its greatest force."""
+    """Share of a force that each of the layer's plays holds back: the half-width of its loop over its
+    greatest force, for loads along one line."""
     creep: Distribution = _ZERO
     """Displacement that creep adds to a lasting force, relative."""
     stiffening: Distribution = _ZERO
-    """Relative growth of the stiffness at a displacement of half the travel."""
+    """Relative growth of the stiffness at a shear of 0.1."""
 
     def describe(self, shear: Shear) -> Shear:
         """Return a table as its builder writes it: with the tolerances of his parts."""
