@@ -58,6 +58,14 @@ export interface Contact extends Envelope {
   joints_age_s?: number | null;
   uncompensated_force_n?: number | null;
   diagnoses?: string[];
+  /** two contacts at once on a pad of six or more electrodes; absent for one */
+  parts?: {
+    position_m: number[];
+    normal: number[];
+    covariance_m2: number[];
+    force_n: number | null;
+    force_std_n: number | null;
+  }[];
   /** false while samples are missing: values of the last sample; absent where true */
   fresh?: boolean;
   force_vector_status?: ForceStatus;

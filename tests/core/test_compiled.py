@@ -40,7 +40,9 @@ def copied(tmp_path: Path) -> Path:
 
 
 @needs_compiled
-@pytest.mark.parametrize("name", ["solve_many.py", "detect_many.py", "frames_many.py", "shear_many.py"])
+@pytest.mark.parametrize(
+    "name", [f"{name}_many.py" for name in ("solve", "detect", "frames", "shear", "pairs")]
+)
 def test_compiled_and_interpreted_stages_give_the_same_bits(name: str) -> None:
     program = str(Path(__file__).with_name(name))
     compiled, interpreted = run(program, "1000"), run(program, "1000", HANDTOUCH_UNCOMPILED="1")
@@ -64,7 +66,7 @@ def test_stages_compiled_from_other_sources_are_refused(copied: Path) -> None:
     [
         ("solve.py", {"solve"}),
         ("locate.py", {"locate"}),
-        ("tables.pxd", {"tables", "tolerances", "locate", "solve"}),
+        ("tables.pxd", {"tables", "tolerances", "locate", "pairs", "solve"}),
         ("receive.pxd", {"receive", "detect", "shear"}),
         ("../build.py", set()),
     ],

@@ -206,4 +206,5 @@ def test_a_loaded_state_continues_without_its_dead_electrode() -> None:
     np.testing.assert_allclose(place, [0.4, 0.6], atol=2e-3)
     recorded = [decode_calibration(encode_calibration(one)) for one in first.calibrations]
     second.load_state(first.save_state(), first.state.layout(), recorded)
-    np.testing.assert_array_equal(pressed(second, range(5, 7)), pressed(first, range(5, 7)))
+    # a pipeline skips its first cycle, which has been processed: both solve as many samples
+    np.testing.assert_array_equal(pressed(second, range(4, 7)), pressed(first, range(5, 7)))

@@ -37,6 +37,9 @@ def fill_state(state: TickState, rng: np.random.Generator) -> None:
         *(state.palm_values, state.force_vector, state.frame_force_vector),
     ):
         column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.3 else rng.normal(size=column.shape)
+    parts = state.parts.reshape(state.pads, 2, -1)
+    parts[:] = rng.normal(size=parts.shape) if rng.random() < 0.5 else np.nan
+    parts[:, :, 15:] = rng.choice(ODD, (state.pads, 2, 2))
     state.total_current_a[:] = rng.normal(size=state.pads)  # of finite counts
     for integers in (state.contact_seq, state.sample_ns, state.begin_ns, state.silent_ns):
         integers[:] = rng.choice(INTEGERS, state.pads)
@@ -115,6 +118,11 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
         for name, column in vectors.items():
             present = vector_status != ForceStatus.NOT_COMPUTED
             assert getattr(contact, name) == (finite(column) if present else None)
+        rows = state.parts[pad].reshape(2, -1) if np.isfinite(state.parts[pad, 0]) else ()
+        assert [tuple(part.values()) for part in contact.parts] == [
+            (row[:3].tolist(), row[3:6].tolist(), row[6:15].tolist(), finite(row[15]), finite(row[16]))
+            for row in rows
+        ]
         later = number >= 200
         assert (len(contact.calibration_id), len(contact.diagnoses)) == ((300, 2) if later else (7, 0))
         assert contact.end_reason == ("stale" if event == "end" else "")

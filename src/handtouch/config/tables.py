@@ -290,6 +290,14 @@ class Sheet(Table):
         description="logarithm of a contact's length over its width, in any direction (1 sigma); default: "
         "round",
     )
+    pair_false_alarm: Annotated[float, Field(ge=0, le=0.002)] = Field(
+        1e-3,
+        description="probability that one contact on a pad of six or more electrodes is reported as two; 0: "
+        "never two",
+    )
+    max_contact_length_mm: NonNegative = Field(
+        10.0, description="length up to which an elongated contact isn't reported as two"
+    )
     max_force_n: Positive | None = Field(
         None,
         description="greatest force of a contact; forces near the maximum current of the sheet, which hardly "

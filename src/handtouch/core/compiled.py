@@ -23,8 +23,8 @@ from types import ModuleType
 from typing import NamedTuple
 
 STAGES = (
-    *("tables", "tolerances", "locate", "force", "solve", "slip", "receive", "detect", "sheets", "publish"),
-    *("kinematics", "frames", "groups", "shear"),
+    *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
+    *("publish", "kinematics", "frames", "groups", "shear"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 DIRECTIVES = {

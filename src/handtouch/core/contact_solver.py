@@ -1,7 +1,7 @@
 """The stages on the arrays of a pad model: position, force and covariance of contacts, in one call a tick.
 
 Public names: `make_solver`, `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`,
-`MAX_SQUARED_MISFIT`.
+`MAX_SQUARED_MISFIT`, `PART_COUNT`, `PART_SLICES`, `PARTS_COUNT`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,16 @@ from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import SEARCH_POINTS, stack_table
 from handtouch.core.stages.locate import Fit
-from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, ContactSolver
+from handtouch.core.stages.pairs import PairFit, grid_points, work_size
+from handtouch.core.stages.solve import (
+    MAX_SQUARED_MISFIT,
+    PART_COUNT,
+    PART_SLICES,
+    PARTS_COUNT,
+    VALUE_COUNT,
+    VALUE_SLICES,
+    ContactSolver,
+)
 from handtouch.core.stages.tables import Placement
 from handtouch.core.stages.tolerances import PartKnowledge, Whitening, part_count
 
@@ -26,15 +35,22 @@ def make_solver(
     offset_std_a: FloatArray,
     force_requested: NDArray[np.bool_],
     values: FloatArray,
+    parts: FloatArray | None = None,
 ) -> ContactSolver:
     """Return a solver of contacts that reads and writes these arrays in place.
 
     currents: (pads, channels) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
     force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
+    parts: (pads, PARTS_COUNT), twice PART_SLICES.
     """
-    n = currents.shape[1]
+    n, points = currents.shape[1], grid_points(SEARCH_POINTS)
+    limits, moments = model.pair_settings()
+    if parts is None:
+        parts = np.full((model.size, PARTS_COUNT), np.nan)
     raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
-    whitening = Whitening(_work(n * n), _work(n), _work(10 * n), _work(part_count(n) * n), _work(n), n)
+    whitening = Whitening(
+        *(_work(n * n), _work(n), _work(n), _work(10 * n), _work(part_count(n) * n), _work(n), n)
+    )
     fit = Fit(
         _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening
     )
@@ -58,6 +74,8 @@ def make_solver(
         view_memory(offset_std_a),
         view_memory(force_requested),
         view_memory(values),
+        PairFit(n, points, _work(work_size(n, points))),
+        *(view_memory(limits), view_memory(moments), view_memory(parts)),
     )
 
 
@@ -65,4 +83,13 @@ def _work(size: int) -> memoryview[float]:
     return view_memory(np.zeros(size))
 
 
-__all__ = ["MAX_SQUARED_MISFIT", "VALUE_COUNT", "VALUE_SLICES", "ContactSolver", "make_solver"]
+__all__ = [
+    "MAX_SQUARED_MISFIT",
+    "PARTS_COUNT",
+    "PART_COUNT",
+    "PART_SLICES",
+    "VALUE_COUNT",
+    "VALUE_SLICES",
+    "ContactSolver",
+    "make_solver",
+]

@@ -22,7 +22,7 @@ from handtouch.config.channels import (
 )
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.memory import view_memory
-from handtouch.core.pad_tables import ForwardTable, SurfacePatches
+from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
 from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.shear import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
@@ -43,7 +43,7 @@ FloatArray = NDArray[np.float64]
 _NODE_TOLERANCES = {"gain_std", "series_std"}
 _SHEET_TOLERANCES = {
     *("ohm_per_square_std", "contact_ohm_std", "alpha_std", "anisotropy_std", "gap_std_mm", "size_std_mm"),
-    *("unevenness_std", "contact_elongation_std", "max_force_n"),
+    *("unevenness_std", "contact_elongation_std", "max_force_n", "pair_false_alarm", "max_contact_length_mm"),
 }
 
 
@@ -392,6 +392,19 @@ class PadModel:
         """Return the tolerances of the pads' parts as the stages take them."""
         columns = zip(self._parts, self.networks, self.forward_tables, strict=True)
         return [stage_tolerances(*parts, network, table) for parts, network, table in columns]
+
+    def pair_settings(self) -> FloatArray:
+        """Return the limit (n,) of one contact's squared misfit beyond which two are tried, and the deviation
+        (n,) [m^2] of half the difference of the variances of an elongated contact's current, (2, n).
+
+        That of a line of length L is L^2 / 24 along it, which is taken as the deviation along any axes.
+        """
+        sheets = [sheet for _, _, sheet in self._parts]
+        limits = [
+            pair_limit(table, sheet.pair_false_alarm)
+            for table, sheet in zip(self.forward_tables, sheets, strict=True)
+        ]
+        return np.array([limits, [(1e-3 * sheet.max_contact_length_mm) ** 2 / 24 for sheet in sheets]])
 
     def stage_laws(self) -> list[PadLaw]:
         """Return the contact laws as the stages take them; they follow later changes."""

@@ -1,6 +1,6 @@
 """Tables of forward models and surfaces for the stages, built once for each distinct pad.
 
-Public names: `ForwardTable`, `SurfacePatches`, `stack_table`, `hermite_table`.
+Public names: `ForwardTable`, `SurfacePatches`, `stack_table`, `hermite_table`, `pair_limit`.
 
 A forward model is tabulated over cells that shrink towards the edges and the ends of the electrodes, as the
 distances do over which its fractions vary.
@@ -39,6 +39,7 @@ _PATCH_STEP = 0.02  # of second differences: currents of a patch vary no faster
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
 """Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
 SEARCH_POINTS = 9
+MIN_PAIR_ELECTRODES = 6
 _BISECTIONS = 60
 _MIN_EDGE_DISTANCE = 1e-6  # of a side
 _MIN_RADIUS_DISTANCE = 1e-3  # of a side: the spreading radius vanishes at an edge
@@ -167,7 +168,7 @@ class ForwardTable:
             view_memory(self.search_fractions),
             view_memory(self.search_cells),
             SEARCH_POINTS,
-            _misfit_scale(int(np.count_nonzero(self.search_fractions.any(axis=0)))),
+            _misfit_scale(_live_electrodes(self)),
         )
 
 
@@ -196,9 +197,29 @@ def _misfit_scale(electrodes: int) -> float:
     freedom = electrodes - 3
     if freedom <= 1:
         return 1.0
-    variance = 2 / (9 * freedom)
-    deviations = NormalDist().inv_cdf(math.erf(math.sqrt(MAX_SQUARED_MISFIT / 2)))
-    return MAX_SQUARED_MISFIT / (freedom * (1 - variance + deviations * math.sqrt(variance)) ** 3)
+    return MAX_SQUARED_MISFIT / _chi_squared(freedom, math.erfc(math.sqrt(MAX_SQUARED_MISFIT / 2)))
+
+
+def _chi_squared(freedom: int, probability: float) -> float:
+    """Return what chi-squared exceeds with this probability, by Wilson and Hilferty."""
+    variance, deviations = 2 / (9 * freedom), NormalDist().inv_cdf(1 - probability)
+    return freedom * (1 - variance + deviations * math.sqrt(variance)) ** 3
+
+
+def pair_limit(table: ForwardTable, false_alarm: float) -> float:
+    """Return the squared misfit of one contact that it exceeds with the probability `false_alarm`.
+
+    Infinite for a probability of 0, and for fewer than six currents: two contacts have six unknowns.
+    """
+    electrodes = _live_electrodes(table)
+    if electrodes < MIN_PAIR_ELECTRODES or not false_alarm > 0:
+        return math.inf
+    return _chi_squared(electrodes - 3, false_alarm)
+
+
+def _live_electrodes(table: ForwardTable) -> int:
+    """Return the number of electrodes that collect current."""
+    return int(np.count_nonzero(table.search_fractions.any(axis=0)))
 
 
 class _Axis:

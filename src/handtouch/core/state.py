@@ -23,7 +23,7 @@ from handtouch.core.memory import view_memory
 from handtouch.core.stages.frames import FRAME_VALUES
 from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
-from handtouch.core.stages.solve import VALUE_COUNT
+from handtouch.core.stages.solve import PARTS_COUNT, VALUE_COUNT
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
@@ -108,6 +108,8 @@ class TickState:
     """contacts that were solved since they began and their outputs were requested"""
     values: Annotated[FloatArray, Stored("<f8", _PADS, VALUE_COUNT, fill=math.nan)]
     """values of the contact's last solved sample, see `stages.solve.VALUE_SLICES`"""
+    parts: Annotated[FloatArray, Stored("<f8", _PADS, PARTS_COUNT, fill=math.nan)]
+    """of each pad the two contacts of that sample, twice `stages.solve.PART_SLICES`; NaN if there is one"""
     uncompensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
     uncompensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
 

@@ -237,7 +237,7 @@ class TickProcessor:
         """Discard the contact values of these pads, because what they are computed from changed."""
         held = self.state
         held.solved[pads] = False
-        held.values[pads] = np.nan
+        held.values[pads] = held.parts[pads] = np.nan
         held.uncompensated_force_n[pads] = np.nan
         self.shear.discard(pads)
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
@@ -252,7 +252,14 @@ class TickProcessor:
         """Set the stages that read the model's arrays in place."""
         columns, self._tables = self.columns, list(model.forward_tables)
         self.solver = make_solver(
-            *(model, self.contacts.currents, self.contacts.offset_std_a, self._estimate_force, columns.values)
+            *(
+                model,
+                self.contacts.currents,
+                self.contacts.offset_std_a,
+                self._estimate_force,
+                columns.values,
+            ),
+            self.state.parts,
         )
         self.output = ContactColumns(
             *(model.size, self.state.memory(), view_memory(model.position_unreliable), _VALUE_COLUMNS),

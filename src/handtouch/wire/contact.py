@@ -32,6 +32,23 @@ EXPERIMENTAL_PERCEPTS = frozenset({"stiffness", "texture", ACTION_REQUEST})
 
 
 @dataclass(frozen=True, slots=True)
+class ContactPart:
+    """One of two contacts on a pad at once."""
+
+    position_m: Vector3
+    """contact position in the link's frame"""
+    normal: Vector3
+    """outward unit normal of the pad at the position"""
+    covariance_m2: Matrix3
+    """covariance of `position_m`, row by row; singular along the normal"""
+    force_n: float | None
+    """normal force by the contact law, without compensation of the sheet's behaviour; nil if the scene
+    requests no forces, or there is only a lower bound"""
+    force_std_n: float | None
+    """standard deviation of `force_n`"""
+
+
+@dataclass(frozen=True, slots=True)
 class Contact:
     """`contact/<hand>/<link>`: begin, update or end of one contact."""
 
@@ -136,6 +153,10 @@ class Contact:
     """the force in the palm's frame; nil unless `palm_status` is `valid`"""
     base_force_vector_n: Vector3 | None = None
     """the force in the base's frame"""
+    parts: Annotated[tuple[dict[str, Any], ...], tuple[ContactPart, ...]] = ()
+    """two contacts, in no order, where the currents of a pad of six or more electrodes support two, not
+    one, at the sheet's `pair_false_alarm`; then `position_m` and `force_n` are those of one contact that
+    replaces both, and `position_status` isn't `valid`; absent otherwise"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ cdef double _find_likely(
 cdef void _integrate(StackTable stack, PadLaw law, ForceResult result, double log_x2, double top) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef void _evaluate(StackTable stack, PadLaw law, ForceResult result, double log_x2) noexcept
+cdef double sheet_ohm_per_square(PadLaw law) noexcept
 cdef double whole_factor(PadLaw law, double total_a) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t)
 cdef double series_resistance(PadLaw law, double[::1] currents, Py_ssize_t first, Py_ssize_t electrodes) noexcept

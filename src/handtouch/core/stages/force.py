@@ -296,6 +296,11 @@ def whole_factor(law: PadLaw, total_a: float) -> float:
     return per_sheet * law.parameters[_DRIVE] / max(total_a, _MIN_CURRENT_A)
 
 
+def sheet_ohm_per_square(law: PadLaw) -> float:
+    """Return the sheet resistance of a law."""
+    return math.exp(law.parameters[_LOG_SHEET])
+
+
 def series_resistance(law: PadLaw, currents: memoryview[float], first: int, electrodes: int) -> float:
     """Return the resistance from contact to ground that the series resistors add [ohm], for its currents."""
     if not law.has_series:

@@ -4,8 +4,8 @@ from handtouch.core.stages cimport tables, tolerances
 
 cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS, _EDGE_BISECTIONS
 cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
-cdef Py_ssize_t _MAX_WHITENINGS
-cdef double _MAX_WHITENING_CELLS
+cdef Py_ssize_t _MAX_WHITENINGS, _ELONGATED_WHITENINGS
+cdef double _MAX_WHITENING_CELLS, _FOURTH_MOMENTS
 cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MAX_EDGE_CELLS, _UNIFORM_VARIANCE, _MIN_INFORMATION, _INFINITY, _HALF_PI
 cdef double _MIN_LONG_ASPECT, _MAX_PROFILE_STEP, _MAX_INSIDE, _TWO_PI
@@ -30,6 +30,10 @@ cdef class Fit:
 cdef void locate(
     ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known, Py_ssize_t number,
     double[::1] gain_covariance, double s, double t) noexcept
+@cython.locals(_=Py_ssize_t, i=Py_ssize_t)
+cdef void locate_elongated(
+    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
+    Py_ssize_t number, double moment_std) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void _whiten(
     ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
@@ -41,11 +45,11 @@ cdef void _refine(
 @cython.locals(i=Py_ssize_t)
 cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
 cdef void _read_model(ModelTable table, Fit fit) noexcept
-cdef double _clamp(ModelTable table, double s) noexcept
+cdef double clamp(ModelTable table, double s) noexcept
 @cython.locals(i=Py_ssize_t)
-cdef double _coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept
+cdef double coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept
 @cython.locals(i=Py_ssize_t)
-cdef double _cell_length(double[::1] nodes, Py_ssize_t cells, double s) noexcept
+cdef double cell_length(double[::1] nodes, Py_ssize_t cells, double s) noexcept
 @cython.locals(_=Py_ssize_t)
 cdef double _cell_at(double[::1] nodes, Py_ssize_t cells, double x) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)

@@ -22,7 +22,8 @@ _BISECTIONS = 50
 _MAX_TRACKED_COST = 25.0  # sum of squares beyond which, and
 _MAX_TRACKED_VARIANCE = 2.5e-3  # variance of a coordinate, in sides, beyond which other starts are tried
 _MAX_WHITENING_CELLS = 1.0  # distance from the position for which tolerances were whitened, and
-_MAX_WHITENINGS = 3
+_MAX_WHITENINGS, _ELONGATED_WHITENINGS = 3, 2
+_FOURTH_MOMENTS = 5.0  # of a line: L^4 / 1920 d^4 f, fractions of about 1 / 6 that vary as sin(pi x / side)
 _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another one is still tried
 _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
@@ -159,6 +160,33 @@ def locate(
         _bound_by_pad(table, fit)
 
 
+def locate_elongated(
+    table: ModelTable,
+    fit: Fit,
+    pad: tolerances.PadTolerances,
+    known: tolerances.PartKnowledge,
+    number: int,
+    moment_std: float,
+) -> None:
+    """Find again, from (s, t) and all over the pad, a contact that may be elongated.
+
+    The result is `s`, `t`, `total` and `cost` alone. moment_std: see `whiten_elongated`.
+    """
+    relative = moment_std / min(table.side_x * table.side_x, table.side_y * table.side_y)
+    error_std = _FOURTH_MOMENTS * relative * relative
+    for _ in range(_ELONGATED_WHITENINGS):
+        fit.read_s = fit.read_t = _INFINITY
+        _read_model(table, fit)
+        total = max(fit.sum, 0.0)
+        tolerances.whiten_elongated(
+            fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t, moment_std, error_std
+        )
+        for i in range(table.electrodes):
+            fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
+        tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.data)
+        _search(table, fit, True)
+
+
 def _whiten(
     table: ModelTable,
     fit: Fit,
@@ -201,12 +229,12 @@ def _read_model(table: ModelTable, fit: Fit) -> None:
         fit.read_s, fit.read_t = fit.s, fit.t
 
 
-def _clamp(table: ModelTable, s: float) -> float:
+def clamp(table: ModelTable, s: float) -> float:
     """Return a coordinate inside the table, in cells."""
     return max(0.0, min(1.0 * table.cells, s))
 
 
-def _coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
+def coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
     """Return the coordinate on the pad at s cells, a cubic between the nodes."""
     i = int(s)
     if i > cells - 1:
@@ -217,8 +245,8 @@ def _coordinate(nodes: memoryview[float], cells: int, s: float) -> float:
     return near + rise * (far - near) + p * (1.0 - p) * ((1.0 - p) * near_slope - p * far_slope)
 
 
-def _cell_length(nodes: memoryview[float], cells: int, s: float) -> float:
-    """Return the derivative of `_coordinate`."""
+def cell_length(nodes: memoryview[float], cells: int, s: float) -> float:
+    """Return the derivative of `coordinate`."""
     i = int(s)
     if i > cells - 1:
         i = cells - 1
@@ -229,11 +257,11 @@ def _cell_length(nodes: memoryview[float], cells: int, s: float) -> float:
 
 
 def _cell_at(nodes: memoryview[float], cells: int, x: float) -> float:
-    """Return the cells of a coordinate on the pad, the inverse of `_coordinate`."""
+    """Return the cells of a coordinate on the pad, the inverse of `coordinate`."""
     low, high = 0.0, 1.0 * cells
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
-        if _coordinate(nodes, cells, middle) < x:
+        if coordinate(nodes, cells, middle) < x:
             low = middle
         else:
             high = middle
@@ -325,12 +353,12 @@ def _maximise(table: ModelTable, fit: Fit, tracked: bool) -> bool:
     for _ in range(_MAX_STEPS):
         s, t, cost, total = fit.s, fit.t, fit.cost, fit.total
         if total > 0.0 and fit.decrement <= _MAX_SETTLED_DECREMENT:
-            fit.s, fit.t = _clamp(table, s + fit.step_s), _clamp(table, t + fit.step_t)
+            fit.s, fit.t = clamp(table, s + fit.step_s), clamp(table, t + fit.step_t)
             fit.step_s, fit.step_t = fit.s - s, fit.t - t
             return True
         if damping > 0.0:
             _compute_step(table, fit, damping)
-        fit.s, fit.t = _clamp(table, s + fit.step_s), _clamp(table, t + fit.step_t)
+        fit.s, fit.t = clamp(table, s + fit.step_s), clamp(table, t + fit.step_t)
         _linearise(table, fit)
         if total <= 0.0 or (fit.total > 0.0 and fit.cost <= cost):
             damping *= 0.1
@@ -413,10 +441,10 @@ def _add_other_positions(table: ModelTable, fit: Fit) -> None:
         for _ in range(_PROFILE_STEPS):
             if along_x and fit.total > 0.0 and fit.yy > 0.0:
                 step = fit.gradient_y / (fit.yy * fit.total)
-                fit.t = _clamp(table, fit.t + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
+                fit.t = clamp(table, fit.t + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
             elif fit.total > 0.0 and fit.xx > 0.0:
                 step = fit.gradient_x / (fit.xx * fit.total)
-                fit.s = _clamp(table, fit.s + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
+                fit.s = clamp(table, fit.s + max(-_MAX_PROFILE_STEP, min(_MAX_PROFILE_STEP, step)))
             _linearise(table, fit)
         if fit.total > 0.0:
             weight = math.exp(-0.5 * max(fit.cost - cost, 0.0)) * longer / _PROFILE_POINTS
@@ -467,11 +495,11 @@ def _compute_covariance(table: ModelTable, fit: Fit) -> None:
 
 def _compute_position(table: ModelTable, fit: Fit) -> None:
     fit.x, fit.y = (
-        _coordinate(table.nodes_x, table.cells, fit.s),
-        _coordinate(table.nodes_y, table.cells, fit.t),
+        coordinate(table.nodes_x, table.cells, fit.s),
+        coordinate(table.nodes_y, table.cells, fit.t),
     )
-    fit.scale_x = _cell_length(table.nodes_x, table.cells, fit.s)
-    fit.scale_y = _cell_length(table.nodes_y, table.cells, fit.t)
+    fit.scale_x = cell_length(table.nodes_x, table.cells, fit.s)
+    fit.scale_y = cell_length(table.nodes_y, table.cells, fit.t)
 
 
 def _invert_information(table: ModelTable, fit: Fit) -> None:
@@ -590,9 +618,9 @@ def _widen_at_edge(table: ModelTable, fit: Fit, along_x: bool) -> None:
     for _ in range(_EDGE_BISECTIONS):
         inward = 0.5 * (likely + unlikely)
         if along_x:
-            fit.s = _clamp(table, s + sign * inward)
+            fit.s = clamp(table, s + sign * inward)
         else:
-            fit.t = _clamp(table, t + sign * inward)
+            fit.t = clamp(table, t + sign * inward)
         _linearise(table, fit)
         if fit.total > 0.0 and fit.cost <= cost + 1.0:
             likely = inward
@@ -601,8 +629,8 @@ def _widen_at_edge(table: ModelTable, fit: Fit, along_x: bool) -> None:
     fit.s, fit.t = s, t
     _linearise(table, fit)
     fit.step_s = fit.step_t = fit.decrement = 0.0
-    distance = _coordinate(nodes, table.cells, _clamp(table, at + sign * likely))
-    distance -= _coordinate(nodes, table.cells, at)
+    distance = coordinate(nodes, table.cells, clamp(table, at + sign * likely))
+    distance -= coordinate(nodes, table.cells, at)
     variance = distance * distance
     if along_x and (fit.var_x > 1e300 or variance > fit.var_x):
         fit.var_x, fit.cov_xy, fit.cov_x_total = variance, 0.0, 0.0

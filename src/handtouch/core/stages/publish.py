@@ -9,7 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import (
+    MAX_SQUARED_MISFIT,
+    PART_COUNT,
+    PART_SLICES,
+    PARTS_COUNT,
+    VALUE_COUNT,
+    VALUE_SLICES,
+)
 
 _VALUES, _FIRST = VALUE_COUNT, VALUE_SLICES["pad_m"].start
 _COUNT = VALUE_SLICES["covariance_m2"].stop - _FIRST
@@ -37,7 +44,7 @@ WRITTEN_FIELDS = (
     *("palm_status", "palm_position_m", "palm_normal", "palm_covariance_m2"),
     *("base_status", "base_position_m", "base_normal", "base_covariance_m2"),
     *("joints_age_s", "uncompensated_force_n", "fresh", "force_vector_status", "force_vector_n"),
-    *("force_vector_covariance_n2", "palm_force_vector_n", "base_force_vector_n"),
+    *("force_vector_covariance_n2", "palm_force_vector_n", "base_force_vector_n", "parts"),
 )
 """Fields in the order in which they are written; the others are texts of the pad."""
 _PALM_VALUES, _PAD_M = 31, VALUE_SLICES["pad_m"].start
@@ -46,6 +53,11 @@ _RESIDUAL, _RESIDUAL_STD = VALUE_SLICES["residual"].start, VALUE_SLICES["residua
 _BASE, _AGE = 15, 30  # in the values of a contact in palm and base
 _VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
 _END = 2  # number of the event
+_PART_COUNT, _PARTS_COUNT, _PART_COVARIANCE = PART_COUNT, PARTS_COUNT, PART_SLICES["covariance_m2"].start
+_PART_FORCE = PART_SLICES["force_n"].start
+_KEY_POSITION, _KEY_NORMAL = WRITTEN_FIELDS.index("position_m"), WRITTEN_FIELDS.index("normal")
+_KEY_COVARIANCE, _KEY_FORCE = WRITTEN_FIELDS.index("covariance_m2"), WRITTEN_FIELDS.index("force_n")
+_KEY_FORCE_STD, _KEY_PARTS = WRITTEN_FIELDS.index("force_std_n"), WRITTEN_FIELDS.index("parts")
 _EVENTS = len(WRITTEN_FIELDS)  # first of the names of events, statuses and reasons
 _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS = (
     _EVENTS + 3,
@@ -201,7 +213,7 @@ class ContactEncoder:
         self.palm_status, self.base_status = arrays["palm_status"], arrays["base_status"]
         self.palm_values, self.group_id = arrays["palm_values"], arrays["group_id"]
         self.vector, self.vector_status = arrays["force_vector"], arrays["force_vector_status"]
-        self.frame_vector = arrays["frame_force_vector"]
+        self.frame_vector, self.parts = arrays["frame_force_vector"], arrays["parts"]
         self.pad_texts, self.pad_text_ends = pad_texts, pad_text_ends
         self.written = self.field = self.fields = 0
 
@@ -266,6 +278,9 @@ class ContactEncoder:
             _write_optional_array(self, self.vector, _VECTOR * pad + 3, 9)
             _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad, 3)
             _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad + 3, 3)
+        if self.parts[_PARTS_COUNT * pad] == self.parts[_PARTS_COUNT * pad]:
+            self.fields += 1
+            _write_parts(self, _PARTS_COUNT * pad)
         self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.fields
         return self.written
 
@@ -299,6 +314,26 @@ def _write_frame(encoder: ContactEncoder, status: int, first: int) -> None:
     _write_optional_array(encoder, encoder.palm_values, first, 3)
     _write_optional_array(encoder, encoder.palm_values, first + 3, 3)
     _write_optional_array(encoder, encoder.palm_values, first + 6, 9)
+
+
+def _write_parts(encoder: ContactEncoder, first: int) -> None:
+    """Write two contacts as maps, from index `first` on."""
+    encoder.field = _KEY_PARTS
+    _write_key(encoder)
+    _write_byte(encoder, 0x92)
+    for k in range(2):
+        at = first + k * _PART_COUNT
+        _write_byte(encoder, 0x85)
+        encoder.field = _KEY_POSITION
+        _write_array(encoder, encoder.parts, at, 3, True)
+        encoder.field = _KEY_NORMAL
+        _write_array(encoder, encoder.parts, at + 3, 3, True)
+        encoder.field = _KEY_COVARIANCE
+        _write_array(encoder, encoder.parts, at + _PART_COVARIANCE, 9, True)
+        encoder.field = _KEY_FORCE
+        _write_number(encoder, encoder.parts[at + _PART_FORCE])
+        encoder.field = _KEY_FORCE_STD
+        _write_number(encoder, encoder.parts[at + _PART_FORCE + 1])
 
 
 def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:

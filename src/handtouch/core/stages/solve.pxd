@@ -1,9 +1,12 @@
 cimport cython
 from libc cimport math
-from handtouch.core.stages cimport force, locate, tables, tolerances
+from handtouch.core.stages cimport force, locate, pairs, tables, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
+cdef Py_ssize_t _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD
+cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT
+cdef double _TWO_PI, _INFINITY
 cdef double _NAN, _VALID, _LOWER_BOUND, _BOUND_SIGMA, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
 cdef Py_ssize_t _PAIRED_CHANNELS
 
@@ -13,6 +16,8 @@ cdef class ContactSolver:
     cdef locate.Fit fit
     cdef tolerances.PartKnowledge known
     cdef tables.Placement placement
+    cdef readonly pairs.PairFit pair
+    cdef double[::1] pair_limits, moment_stds, parts
     cdef force.ForceResult result
     cdef Py_ssize_t electrodes
     cdef double[::1] by_x, by_y, by_total
@@ -24,6 +29,12 @@ cdef class ContactSolver:
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit,
                table=locate.ModelTable, values='double[::1]')
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(k=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit, table=locate.ModelTable,
+               at=tables.Placement, parts='double[::1]')
+cdef void _resolve_pair(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(other=Py_ssize_t, row=Py_ssize_t, n=Py_ssize_t, step=Py_ssize_t, fit=locate.Fit,
+               pair=pairs.PairFit, law=force.PadLaw, table=locate.ModelTable)
+cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t k) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept

@@ -1,13 +1,14 @@
 """Contacts of a tick: locate, estimate the force, place; one row of `values` a pad.
 
-Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFIT`.
+Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFIT`, `PART_COUNT`,
+`PART_SLICES`, `PARTS_COUNT`.
 """
 
 from __future__ import annotations
 
 import math
 
-from handtouch.core.stages import force, locate, tables, tolerances
+from handtouch.core.stages import force, locate, pairs, tables, tolerances
 from handtouch.field import contact_law
 
 _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
@@ -29,6 +30,24 @@ VALUE_SLICES = {
     "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, see MAX_SQUARED_MISFIT
 }
 """Layout of a row of values."""
+_PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD, _PART_COUNT = (
+    0,
+    3,
+    6,
+    15,
+    16,
+    17,
+)
+_PARTS_COUNT = 2 * _PART_COUNT
+PART_COUNT, PARTS_COUNT = _PART_COUNT, _PARTS_COUNT
+PART_SLICES = {
+    "position_m": slice(_PART_POSITION, _PART_POSITION + 3),
+    "normal": slice(_PART_NORMAL, _PART_NORMAL + 3),
+    "covariance_m2": slice(_PART_COVARIANCE, _PART_COVARIANCE + 9),
+    "force_n": slice(_PART_FORCE, _PART_FORCE + 1),
+    "force_std_n": slice(_PART_FORCE_STD, _PART_FORCE_STD + 1),
+}
+"""Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
 _NAN = float("nan")
 _VALID, _LOWER_BOUND = 0.0, 1.0  # force_status
 _BOUND_SIGMA = contact_law.BOUND_SIGMA
@@ -40,6 +59,7 @@ directions that move the position are as large as along the observable one, and 
 that explains the residual."""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
+_TWO_PI, _INFINITY = 2.0 * math.pi, math.inf
 _PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 
 
@@ -52,7 +72,9 @@ class ContactSolver:
     offset_std: (pads,) of the sum of the currents, from the
     baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
     force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
-    begins at the position in it.
+    begins at the position in it. pair_limits: (pads,) squared misfit of one contact from which on two are
+    tried, infinite where they can't be resolved; moment_stds: (pads,) [m^2], that of an elongated contact,
+    see `tolerances.whiten_elongated`; parts: (pads PARTS_COUNT,), the two contacts, NaN if there is one.
     """
 
     def __init__(
@@ -73,7 +95,12 @@ class ContactSolver:
         offset_std: memoryview[float],
         force_requested: memoryview[int],
         values: memoryview[float],
+        pair: pairs.PairFit,
+        pair_limits: memoryview[float],
+        moment_stds: memoryview[float],
+        parts: memoryview[float],
     ) -> None:
+        self.pair, self.pair_limits, self.moment_stds, self.parts = pair, pair_limits, moment_stds, parts
         self.models, self.pad_tolerances = models, pad_tolerances
         self.laws, self.surfaces = laws, surfaces
         self.stack, self.fit, self.placement = stack, fit, placement
@@ -116,6 +143,8 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     )
     for i in range(_COUNT):
         values[row + i] = _NAN
+    for i in range(_PARTS_COUNT):
+        solver.parts[pad * _PARTS_COUNT + i] = _NAN
     if not fit.found:
         return
     values[row + _CELLS], values[row + _CELLS + 1] = fit.s, fit.t
@@ -128,6 +157,95 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS:
         _add_extent(table, fit, values[row + _RESIDUAL])
     _write_position(solver, pad)
+    if fit.cost > _MAX_SQUARED_MISFIT and solver.pair_limits[pad] < _INFINITY:
+        _resolve_pair(solver, pad)
+
+
+def _resolve_pair(solver: ContactSolver, pad: int) -> None:
+    """Write the two contacts of a pad, where the currents support two rather than one."""
+    fit, pair, table, parts = solver.fit, solver.pair, solver.models[pad], solver.parts
+    scale2 = solver.placement.scale_m * solver.placement.scale_m
+    pairs.fit_pair(
+        table,
+        fit,
+        pair,
+        solver.pad_tolerances[pad],
+        solver.known,
+        pad,
+        solver.gain_covariance,
+        solver.moment_stds[pad] / scale2,
+        solver.pair_limits[pad],
+    )
+    if not pair.found:
+        return
+    for k in range(2):
+        row = pad * _PARTS_COUNT + k * _PART_COUNT
+        fit.s, fit.t = pair.place[2 * k], pair.place[2 * k + 1]
+        fit.x = locate.coordinate(table.nodes_x, table.cells, fit.s)
+        fit.y = locate.coordinate(table.nodes_y, table.cells, fit.t)
+        fit.scale_x = locate.cell_length(table.nodes_x, table.cells, fit.s)
+        fit.scale_y = locate.cell_length(table.nodes_y, table.cells, fit.t)
+        fit.var_x, fit.var_y = pair.covariance[10 * k], pair.covariance[10 * k + 5]
+        fit.cov_xy = pair.covariance[10 * k + 1]
+        tables.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
+        at = solver.placement
+        if solver.force_requested[pad]:
+            _estimate_part_force(solver, pad, k)
+        parts[row + _PART_POSITION], parts[row + _PART_NORMAL] = at.px, at.nx
+        parts[row + _PART_POSITION + 1], parts[row + _PART_NORMAL + 1] = at.py, at.ny
+        parts[row + _PART_POSITION + 2], parts[row + _PART_NORMAL + 2] = at.pz, at.nz
+        _add_size(solver, pad)
+        _add_overhang(solver, pad)
+        _write_row(parts, row + _PART_COVARIANCE, fit, at, at.tx, at.wx)
+        _write_row(parts, row + _PART_COVARIANCE + 3, fit, at, at.ty, at.wy)
+        _write_row(parts, row + _PART_COVARIANCE + 6, fit, at, at.tz, at.wz)
+
+
+def _estimate_part_force(solver: ContactSolver, pad: int, k: int) -> None:
+    """Write the force of contact k of a pair; NaN where it has only a lower bound.
+
+    The other contact's current raises the sheet's potential at this one, by Green's function of a grounded
+    boundary, ln(1 + R R' / d^2) / 2 with both spreading radii and the distance, exact in a disc; between bare
+    stretches it is more: half of what it changes the force by is added to the standard deviation.
+    """
+    fit, pair, law, table = solver.fit, solver.pair, solver.laws[pad], solver.models[pad]
+    other, row = 1 - k, pad * _PARTS_COUNT + k * _PART_COUNT
+    total, n = pair.total[k], fit.whitening.electrodes
+    dx = fit.x - locate.coordinate(table.nodes_x, table.cells, pair.place[2 * other])
+    dy = fit.y - locate.coordinate(table.nodes_y, table.cells, pair.place[2 * other + 1])
+    mutual = math.exp(pair.spreading[k] + pair.spreading[other]) / (dx * dx + dy * dy)
+    mutual = 0.5 * math.log(1.0 + mutual) * force.sheet_ohm_per_square(law) / _TWO_PI
+    mutual *= pair.total[other] / total
+    resistors = force.series_resistance(law, solver.currents, pad * solver.electrodes, n)
+    resistors *= 1.0 + pair.total[other] / total
+    slope_x, slope_y = pair.spreading[2 + k] / fit.scale_x, pair.spreading[4 + k] / fit.scale_y
+    whole = force.whole_factor(law, total) / total
+    variance = slope_x * slope_x * fit.var_x + slope_y * slope_y * fit.var_y
+    variance += 2.0 * slope_x * slope_y * fit.cov_xy
+    with_x, with_y = pair.with_total[2 * k], pair.with_total[2 * k + 1]
+    variance += 2.0 * whole * (slope_x * with_x + slope_y * with_y)
+    scale_m = solver.placement.scale_m
+    force_n = 0.0
+    for step in range(2):
+        force.estimate_force(
+            solver.stack,
+            law,
+            solver.result,
+            total,
+            math.sqrt(pair.var_total[k]),
+            pair.spreading[k] + math.log(scale_m),
+            (slope_x * slope_x + slope_y * slope_y) / (scale_m * scale_m),
+            variance,
+            resistors + step * mutual,
+        )
+        if solver.result.status != _VALID:
+            return
+        if step == 0:
+            force_n = solver.result.force_n
+    change = 0.5 * (solver.result.force_n - force_n)
+    solver.parts[row + _PART_FORCE] = solver.result.force_n
+    std_n = solver.result.std_n
+    solver.parts[row + _PART_FORCE_STD] = math.sqrt(std_n * std_n + change * change)
 
 
 def _propagate(solver: ContactSolver, pad: int) -> None:

@@ -19,7 +19,7 @@ cdef class PartKnowledge:
     cdef Py_ssize_t size, rows, parts
 
 cdef class Whitening:
-    cdef double[::1] matrix, shift, fields, changes, vector
+    cdef double[::1] matrix, shift, modelled, fields, changes, vector
     cdef Py_ssize_t electrodes, channels
 
 cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
@@ -27,13 +27,30 @@ cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, channels=Py_ssize_t, matrix='double[::1]')
 cdef void whiten_by_gains(
     Whitening whitening, double[::1] gain_covariance, Py_ssize_t number, double[::1] readings) noexcept
-@cython.locals(
-    n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
-    row=Py_ssize_t, matrix='double[::1]', vector='double[::1]', changes='double[::1]', axes='double[::1]',
-    offsets='double[::1]')
 cdef void whiten(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
     double[::1] fractions, double[::1] weight, double total, double s, double t) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, columns=Py_ssize_t)
+cdef void whiten_elongated(
+    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
+    double[::1] fractions, double[::1] weight, double total, double s, double t, double moment_std,
+    double error_std) noexcept
+cdef void whiten_pair(
+    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
+    double[::1] fractions, double[::1] weight, double total_1, double s_1, double t_1,
+    double total_2, double s_2, double t_2) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
+cdef void _begin(Whitening whitening) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, matrix='double[::1]')
+cdef void _add_contact(
+    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
+    double[::1] fractions, Py_ssize_t first, double[::1] weight, double total, double s, double t) noexcept
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
+    row=Py_ssize_t, vector='double[::1]', changes='double[::1]', axes='double[::1]',
+    offsets='double[::1]')
+cdef void _add_parts(
+    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void apply_whitening(
     Whitening whitening, double[::1] values, Py_ssize_t first, double[::1] out) noexcept
@@ -41,14 +58,17 @@ cdef void apply_whitening(
 cdef void transpose_whitening(
     Whitening whitening, double[::1] values, double[::1] weight, double[::1] out) noexcept
 @cython.locals(
-    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, first=Py_ssize_t, columns=Py_ssize_t, changes='double[::1]', fields='double[::1]')
-cdef void _compute_changes(
-    Whitening whitening, PadTolerances pad, double[::1] fractions, double[::1] weight, double total,
-    double s, double t) noexcept
-@cython.locals(
-    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, cell=Py_ssize_t, vector='double[::1]', fields='double[::1]')
+    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, resistor=Py_ssize_t, columns=Py_ssize_t, changes='double[::1]',
+    fields='double[::1]')
+cdef void _add_changes(
+    Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
+    double total, double s, double t) noexcept
+@cython.locals(cell=Py_ssize_t)
 cdef void _add_elongation(
     Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
+cdef void _add_second_derivatives(
+    Whitening whitening, double[::1] weight, double total, double std) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)

@@ -90,7 +90,8 @@ class PartKnowledge:
 class Whitening:
     """Whitening of currents over noise: `matrix` (n n,) is lower triangular; its product with currents that
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
-    to the currents over noise. `fields` (10 n,), `changes` (p n,), `vector` (n,): working memory.
+    to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (10 n,),
+    `changes` (p n,), `vector` (n,): working memory.
     `electrodes` is n of the present pad, `channels` that of the pad with most.
     """
 
@@ -98,12 +99,13 @@ class Whitening:
         self,
         matrix: memoryview[float],
         shift: memoryview[float],
+        modelled: memoryview[float],
         fields: memoryview[float],
         changes: memoryview[float],
         vector: memoryview[float],
         channels: int,
     ) -> None:
-        self.matrix, self.shift = matrix, shift
+        self.matrix, self.shift, self.modelled = matrix, shift, modelled
         self.fields, self.changes, self.vector = fields, changes, vector
         self.electrodes = self.channels = channels
 
@@ -145,37 +147,123 @@ def whiten(
 
     number: of the pad. fractions: (n,) there. weight: (n,) 1 / noise.
     """
-    n, matrix, vector, changes = whitening.electrodes, whitening.matrix, whitening.vector, whitening.changes
-    parts = part_count(n)
-    size, axes, offsets = n + parts, known.axes, known.offsets
+    _begin(whitening)
+    _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
+    _add_parts(whitening, pad, known, number)
+    _invert_root(whitening.matrix, whitening.electrodes)
+
+
+def whiten_elongated(
+    whitening: Whitening,
+    pad: PadTolerances,
+    known: PartKnowledge,
+    number: int,
+    fractions: memoryview[float],
+    weight: memoryview[float],
+    total: float,
+    s: float,
+    t: float,
+    moment_std: float,
+    error_std: float,
+) -> None:
+    """Set them for a contact that may be elongated: half the difference of its current's variances along
+    any two axes at right angles has the deviation `moment_std`, in squares of the rectangle's unit.
+
+    What fourth moments add is taken as `error_std` of each fraction.
+    """
+    n = whitening.electrodes
+    _begin(whitening)
     for i in range(n):
-        whitening.shift[i] = 0.0
+        error = error_std * total * weight[i]
+        whitening.matrix[i * n + i] += error * error
+    _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
+    _add_parts(whitening, pad, known, number)
+    ratio, columns = pad.cell_ratio, (5 + _WAVES) * n
+    tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, whitening.fields)
+    _add_second_derivatives(whitening, weight, total, moment_std)
+    _invert_root(whitening.matrix, n)
+
+
+def whiten_pair(
+    whitening: Whitening,
+    pad: PadTolerances,
+    known: PartKnowledge,
+    number: int,
+    fractions: memoryview[float],
+    weight: memoryview[float],
+    total_1: float,
+    s_1: float,
+    t_1: float,
+    total_2: float,
+    s_2: float,
+    t_2: float,
+) -> None:
+    """Set them for two contacts on one pad, `fractions` (2 n,) of the first, then of the second."""
+    _begin(whitening)
+    _add_contact(whitening, pad, known, number, fractions, 0, weight, total_1, s_1, t_1)
+    _add_contact(whitening, pad, known, number, fractions, whitening.electrodes, weight, total_2, s_2, t_2)
+    _add_parts(whitening, pad, known, number)
+    _invert_root(whitening.matrix, whitening.electrodes)
+
+
+def _begin(whitening: Whitening) -> None:
+    """Set the covariance to that of noise, and what contacts add up to 0."""
+    n = whitening.electrodes
+    for i in range(n):
+        whitening.shift[i] = whitening.modelled[i] = 0.0
         for j in range(n):
-            matrix[i * n + j] = 0.0
+            whitening.matrix[i * n + j] = 0.0
+        whitening.matrix[i * n + i] = 1.0
+    for i in range(part_count(n) * n):
+        whitening.changes[i] = 0.0
+
+
+def _add_contact(
+    whitening: Whitening,
+    pad: PadTolerances,
+    known: PartKnowledge,
+    number: int,
+    fractions: memoryview[float],
+    first: int,
+    weight: memoryview[float],
+    total: float,
+    s: float,
+    t: float,
+) -> None:
+    """Add what is a contact's own: errors of its touch and shape, and its share of the changes by parts."""
+    n, matrix = whitening.electrodes, whitening.matrix
+    for i in range(n):
         error = known.touch_errors[number] * total * weight[i]
-        matrix[i * n + i] = 1.0 + error * error
-    varied = 0
+        matrix[i * n + i] += error * error
+        whitening.modelled[i] += total * fractions[first + i] * weight[i]
     if not pad.is_shape_exact:
-        _compute_changes(whitening, pad, fractions, weight, total, s, t)
+        _add_changes(whitening, pad, fractions, first, weight, total, s, t)
+    if pad.is_elongated:
+        _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
+
+
+def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, number: int) -> None:
+    """Add the covariance by gains and parts, which all contacts share; set the shift."""
+    n, vector, changes = whitening.electrodes, whitening.vector, whitening.changes
+    parts = part_count(n)
+    size, axes, offsets, varied = n + parts, known.axes, known.offsets, 0
+    if not pad.is_shape_exact:
         varied = parts if pad.has_series else parts - n - 1
     for k in range(n + varied):
         row = number * known.size + k * size
         for i in range(n):
-            vector[i] = axes[row + i] * total * fractions[i] * weight[i] if i >= k else 0.0
+            vector[i] = axes[row + i] * whitening.modelled[i] if i >= k else 0.0
         for j in range(max(k - n, 0), min(known.ends[number * known.rows + k] - n, varied)):
             step = axes[row + n + j]
             if step != 0.0:
                 for i in range(n):
                     vector[i] += step * changes[j * n + i]
         _add_square(whitening)
-    if pad.is_elongated:
-        _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
     for j in range(varied):
         step = offsets[number * known.parts + j]
         if step != 0.0:
             for i in range(n):
                 whitening.shift[i] += step * changes[j * n + i]
-    _invert_root(matrix, n)
 
 
 def apply_whitening(
@@ -203,35 +291,36 @@ def transpose_whitening(
         out[i] = row * weight[i]
 
 
-def _compute_changes(
+def _add_changes(
     whitening: Whitening,
     pad: PadTolerances,
     fractions: memoryview[float],
+    first: int,
     weight: memoryview[float],
     total: float,
     s: float,
     t: float,
 ) -> None:
-    """Compute the changes of the currents over noise by one standard deviation of each part."""
+    """Add the changes of the currents over noise by one standard deviation of each part."""
     n, changes, fields = whitening.electrodes, whitening.changes, whitening.fields
     columns, ratio = (5 + _WAVES) * n, pad.cell_ratio
     tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, fields)
     for i in range(n):
         scale = total * weight[i]
         for k in range(2 * n):
-            changes[k * n + i] = pad.end_vectors[k * n + i] * fields[k] * scale
-        changes[2 * n * n + i] = pad.aspect_std * fields[2 * n + i] * scale
+            changes[k * n + i] += pad.end_vectors[k * n + i] * fields[k] * scale
+        changes[2 * n * n + i] += pad.aspect_std * fields[2 * n + i] * scale
         for k in range(_WAVES):
-            changes[(2 * n + 1 + k) * n + i] = pad.wave_std * fields[(3 + k) * n + i] * scale
+            changes[(2 * n + 1 + k) * n + i] += pad.wave_std * fields[(3 + k) * n + i] * scale
         if pad.has_series:
-            first = (2 * n + 1 + _WAVES) * n + i
+            resistor = (2 * n + 1 + _WAVES) * n + i
             together = 0.0
             for k in range(n):
-                change = pad.series_vectors[k * n + i] * fractions[k]
-                changes[first + k * n] = pad.series_std * change * scale
+                change = pad.series_vectors[k * n + i] * fractions[first + k]
+                changes[resistor + k * n] += pad.series_std * change * scale
                 together += change
             # a larger sheet resistance is a smaller one of every resistor
-            changes[first + n * n] = -pad.sheet_std * together * scale
+            changes[resistor + n * n] -= pad.sheet_std * together * scale
 
 
 def _add_elongation(
@@ -242,12 +331,19 @@ def _add_elongation(
     Current that spreads with variances v + d along one direction and v - d at right angles to it adds d times
     the second derivative along that direction, as potentials are harmonic; the direction is unknown.
     """
-    n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
     cell = int(s)
     if cell > pad.cells - 1:
         cell = pad.cells - 1
     beyond = s - cell
     std = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
+    _add_second_derivatives(whitening, weight, total, std)
+
+
+def _add_second_derivatives(
+    whitening: Whitening, weight: memoryview[float], total: float, std: float
+) -> None:
+    """Add the covariance by second derivatives, which are in `fields`, with amplitudes of deviation `std`."""
+    n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
     for k in range(2):
         for i in range(n):
             vector[i] = std * fields[(3 + _WAVES + k) * n + i] * total * weight[i]
