@@ -108,6 +108,7 @@ class Bench:
             normal_force_n=normal * (1 + NORMAL_STD * self.rng.standard_normal(len(normal))),
             centre_m=centre + CENTRE_STD_M * self.rng.standard_normal(centre.shape),
             centre_std_m=CENTRE_STD_M,
+            normal_force_std_n=NORMAL_STD * normal,
         )
         return found.motion[:2] - found.motion[:2, :1], found.covariance[:, :2, :2]
 

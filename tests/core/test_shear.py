@@ -37,7 +37,12 @@ def test_the_force_vector_is_that_of_the_theory(bench: ShearBench, pad: int) -> 
         bench.touch(pad, normal_n, centre_m, counts)
         bench.tick()
         found = theory.estimate(
-            counts, NOISE_COUNTS, normal_force_n=normal_n, centre_m=centre_m, centre_std_m=CENTRE_STD_M
+            counts,
+            NOISE_COUNTS,
+            normal_force_n=normal_n,
+            centre_m=centre_m,
+            centre_std_m=CENTRE_STD_M,
+            normal_force_std_n=FORCE_STD_N,
         )
         alone = layer.force(found.motion[:2] - rest)
         peak_n = max(peak_n, float(np.hypot(*alone.vector_n)))

@@ -104,7 +104,7 @@ def test_twist_moves_the_ratios_of_a_pinwheel_only() -> None:
 def test_off_centre_pressure_looks_like_displacement_unless_its_centre_is_known() -> None:
     pad = ShearPad(PATTERNS["discs"], 5.0, FILM)
     force, centre = np.array([5.0]), np.array([[2 * MM], [-1 * MM]])
-    tilt = np.einsum("ncm,cm->nm", FILM.tilt_slopes(force, pad.pattern.centroids_m), centre)
+    tilt, _, _ = FILM.tilts(force, centre, pad.pattern.centroids_m)
     currents = pad.currents(np.zeros((2, 1)), FILM.conductance(force), tilt)
     biased = pad.estimate(currents, 1e-6).motion
     assert biased[0, 0] > 10e-6
@@ -114,7 +114,27 @@ def test_off_centre_pressure_looks_like_displacement_unless_its_centre_is_known(
     np.testing.assert_allclose(FILM.normal_force(compensated.conductance_s_per_m2), force, rtol=1e-9)
     unsure = pad.estimate(currents, 1e-6, normal_force_n=force, centre_m=centre, centre_std_m=1 * MM)
     expected = np.abs(biased[1, 0])  # 1 mm in y moved it so far
-    assert math.sqrt(unsure.covariance[0, 1, 1]) == pytest.approx(expected, rel=0.1)
+    assert math.sqrt(unsure.covariance[0, 1, 1]) == pytest.approx(expected, rel=0.15)
+    rough = pad.estimate(currents, 1e-6, normal_force_n=force, centre_m=centre, normal_force_std_n=0.1)
+    weaker = pad.estimate(currents, 1e-6, normal_force_n=force - 0.1, centre_m=centre).motion
+    assert math.sqrt(rough.covariance[0, 0, 0]) == pytest.approx(abs(weaker[0, 0]), rel=0.1)
+
+
+def test_conductance_of_channels_follows_the_pressure_there_and_its_derivatives_those_of_it() -> None:
+    places = PATTERNS["discs"].centroids_m
+    for centre in (np.array([1 * MM, -2 * MM]), np.array([9 * MM, 5 * MM])):
+        force = 3.0
+        logs, by_centre, by_force = FILM.tilts(force, centre, places)
+        pressure = force / FILM.plate_m2 * np.maximum(1 + places @ centre / FILM.gyration_m2, 0.0)
+        ratio = (1 + pressure / FILM.reference_pa) ** FILM.alpha * FILM.siemens_per_m2
+        np.testing.assert_allclose(np.exp(logs) * FILM.conductance(force), ratio, rtol=1e-12)
+        step = 1e-7
+        for axis in range(2):
+            moved = centre + step * np.eye(2)[axis]
+            change = (FILM.tilts(force, moved, places)[0] - logs) / step
+            np.testing.assert_allclose(by_centre[:, axis], change, rtol=1e-3, atol=1e-3)
+        change = (FILM.tilts(force + step, centre, places)[0] - logs) / step
+        np.testing.assert_allclose(by_force, change, rtol=1e-4, atol=1e-6)
 
 
 def test_currents_that_no_displacement_has_give_nan() -> None:

@@ -24,7 +24,6 @@ from handtouch.hand import mount_transform
 
 FloatArray = NDArray[np.float64]
 _WORK = 55
-_HIGH_LOAD = 1e12  # over the film's reference pressure
 
 
 class ShearParameters(NamedTuple):
@@ -150,7 +149,8 @@ def _parameters(
         "zero_std_n": layer.zero_std_n,
         "centre_m": np.array(surface.extent_m) / 2,
         "log_gain": [math.log(node.channel_scale[number]) for number in shear_numbers(pad)],
-        "tilt_per_m": film.tilt_slopes(_HIGH_LOAD * film.plate_m2, pattern.centroids_m).ravel(),
+        "lean_per_m": (pattern.centroids_m / film.gyration_m2).ravel(),
+        "alpha": film.alpha,
         "along": rotation[:, 0],
         **_geometry(pattern),
     }

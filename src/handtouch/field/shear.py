@@ -331,10 +331,26 @@ class FilmLaw:
         ratio = np.asarray(conductance_s_per_m2, np.float64) / self.siemens_per_m2
         return self.plate_m2 * self.reference_pa * (ratio ** (1 / self.alpha) - 1)
 
-    def tilt_slopes(self, normal_force_n: npt.ArrayLike, centroids_m: FloatArray) -> FloatArray:
-        """Return d ln(conductance) / d(centre of pressure) [1/m] of each channel, shape (n, 2, ...)."""
-        load = np.asarray(normal_force_n, np.float64) / self.plate_m2 / self.reference_pa
-        return self.alpha / self.gyration_m2 * np.multiply.outer(centroids_m, load / (1 + load))
+    def tilts(
+        self, normal_force_n: npt.ArrayLike, centre_m: npt.ArrayLike, centroids_m: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return ln(conductance) of each channel over that of a central force, and its derivatives.
+
+        normal_force_n: (...). centre_m: (2, ...) of its pressure, which is linear over the plate, and 0 where
+        the plate would lift. centroids_m: (n, 2) of the channels. Returns (n, ...), derivatives by the centre
+        (n, 2, ...) [1/m] and by the force (n, ...) [1/N].
+        """
+        reference_n = self.plate_m2 * self.reference_pa
+        load = np.asarray(normal_force_n, np.float64) / reference_n
+        lean = (
+            1 + np.einsum("nc,c...->n...", centroids_m, np.asarray(centre_m, np.float64)) / self.gyration_m2
+        )
+        lean = np.maximum(lean, 0.0)
+        logs = self.alpha * (np.log1p(load * lean) - np.log1p(load))
+        rate = self.alpha * load * (lean > 0) / (1 + load * lean)
+        arms = centroids_m.reshape(*centroids_m.shape, *[1] * load.ndim) / self.gyration_m2
+        by_force = self.alpha / reference_n * (lean / (1 + load * lean) - 1 / (1 + load))
+        return logs, arms * rate[:, None], by_force
 
 
 @dataclass(frozen=True)
@@ -383,11 +399,12 @@ class ShearPad:
         normal_force_n: npt.ArrayLike = 0.0,
         centre_m: npt.ArrayLike = (0.0, 0.0),
         centre_std_m: float = 0.0,
+        normal_force_std_n: npt.ArrayLike = 0.0,
     ) -> ShearEstimate:
         """Return motion and conductance for currents (n, ...), by maximum likelihood.
 
         noise_a: standard deviation of each current, broadcast against them. normal_force_n (...), centre_m
-        (2, ...) with its standard deviation: of the contact above, whose pressure is not even; used with
+        (2, ...) with their standard deviations: of the contact above, whose pressure is not even; used with
         `film` only. Raises ValueError unless the first axis has the pattern's channels.
         """
         currents = np.asarray(currents_a, np.float64)
@@ -397,17 +414,20 @@ class ShearPad:
         shape = currents.shape[1:]
         read = np.where(currents > 0, currents, np.nan).reshape(count, -1)
         noise = np.broadcast_to(np.asarray(noise_a, np.float64), currents.shape).reshape(count, -1)
-        slopes = np.zeros((count, 2, read.shape[1]))
+        tilt, weight = np.zeros_like(read), np.zeros((read.shape[1], count, count))
         if self.film is not None:
-            force = np.broadcast_to(np.asarray(normal_force_n, np.float64), shape).ravel()
-            slopes = self.film.tilt_slopes(np.maximum(force, 0.0), self.pattern.centroids_m)
-        centre = np.asarray(centre_m, np.float64)
-        centre = np.broadcast_to(centre.reshape(2, *centre.shape[1:] or [1] * len(shape)), (2, *shape))
-        centre = centre.reshape(2, -1)
-        tilt = np.einsum("ncm,cm->nm", slopes, centre)
+            force, force_std = (
+                np.broadcast_to(np.asarray(value, np.float64), shape).ravel()
+                for value in (normal_force_n, normal_force_std_n)
+            )
+            centre = np.asarray(centre_m, np.float64)
+            centre = np.broadcast_to(centre.reshape(2, *centre.shape[1:] or [1] * len(shape)), (2, *shape))
+            tilt, by_centre, by_force = self.film.tilts(
+                np.maximum(force, 0.0), centre.reshape(2, -1), self.pattern.centroids_m
+            )
+            spread = np.concatenate([by_centre * centre_std_m, (by_force * force_std)[:, None]], axis=1)
+            weight = np.einsum("icm,jcm->mij", spread, spread)
         # in logarithms: ln I = ln(V Y) + ln area + tilt
-        spread = slopes * centre_std_m
-        weight = np.einsum("icm,jcm->mij", spread, spread)
         weight += np.einsum("im,ij->mij", (noise / read) ** 2, np.eye(count))
         information = np.full_like(weight, np.nan)
         known = np.isfinite(weight).all(axis=(1, 2)) & (noise > 0).all(axis=0)

@@ -49,6 +49,15 @@ class LayerHistory:
         self._plays = np.zeros((len(self._radii), 2))
         self._crept = np.zeros(2)
 
+    @property
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """Memory of the layer: what `restore` takes."""
+        return self._plays.copy(), self._crept.copy()
+
+    def restore(self, state: tuple[FloatArray, FloatArray]) -> None:
+        """Return to an earlier state."""
+        self._plays, self._crept = state[0].copy(), state[1].copy()
+
     def advance(self, force_n: FloatArray, elapsed_s: float) -> FloatArray:
         """Apply a force (2,) for a time; return the displacement (2,) [m] at its end."""
         hidden = self._hidden

@@ -77,25 +77,28 @@ class VirtualShear:
 
     def _restart(self) -> None:
         self._history = LayerHistory(self._shear, self._hidden)
-        self._first_step, self._moved = 0, [np.zeros(2)]
+        self._first_step, self._states = 0, [self._history.state]
 
     def _displacement_m(self, times_s: FloatArray) -> FloatArray:
-        """Return displacements (2, n) of the skin, between steps of the layer's history."""
+        """Return displacements (2, n) of the skin, each under the force of its time after the last step."""
         if times_s.min() < self._first_step * _STEP_S:
             self._restart()
-        while (len(self._moved) - 1 + self._first_step) * _STEP_S <= times_s.max():
-            done = self._first_step + len(self._moved) - 1
+        while (len(self._states) - 1 + self._first_step) * _STEP_S <= times_s.max():
+            done = self._first_step + len(self._states) - 1
             at = (done + 1 + np.arange(_CHUNK_STEPS)) * _STEP_S
             for force in self.tangential_n(np.asarray(at, np.float64)).T:
-                self._moved.append(self._history.advance(force, _STEP_S))
-        if len(self._moved) > 2 * _MAX_KEPT_STEPS:
-            del self._moved[:_MAX_KEPT_STEPS]
+                self._history.advance(force, _STEP_S)
+                self._states.append(self._history.state)
+        if len(self._states) > 2 * _MAX_KEPT_STEPS:
+            del self._states[:_MAX_KEPT_STEPS]
             self._first_step += _MAX_KEPT_STEPS
-        step = np.clip(times_s / _STEP_S - self._first_step, 0, len(self._moved) - 1)
-        first = int(step.min())
-        path = np.array(self._moved[first : int(step.max()) + 2])
-        grid = np.arange(len(path)) + first
-        return np.stack([np.interp(step, grid, along) for along in path.T])
+        last, moved = self._states[-1], np.zeros((2, len(times_s)))
+        steps = np.floor(times_s / _STEP_S).astype(int)
+        for k, force in enumerate(self.tangential_n(times_s).T):
+            self._history.restore(self._states[int(steps[k]) - self._first_step])
+            moved[:, k] = self._history.advance(force, float(times_s[k] - steps[k] * _STEP_S))
+        self._history.restore(last)
+        return moved
 
     def _scenario_time_s(self, times_s: FloatArray) -> FloatArray:
         return times_s % self._repeat_period_s if np.isfinite(self._repeat_period_s) else times_s

@@ -3,8 +3,8 @@ from libc cimport math
 from handtouch.core.stages.receive cimport SampleMemory
 
 cdef Py_ssize_t _CHANNELS, _UNKNOWNS, _POINT, _FILM, _OVERLAP, _LOST, _RADIUS, _INSET, _TRAVEL, _NOISE, _LOAD
-cdef Py_ssize_t _STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE, _LOG_GAIN, _TILT
-cdef Py_ssize_t _ALONG, _NUMBERS, _NORMAL, _VALUES, _PAD_M, _FORCE, _FORCE_STD, _COVARIANCE, _VECTOR, _CLEAR
+cdef Py_ssize_t _STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE, _LOG_GAIN, _LEAN
+cdef Py_ssize_t _ALONG, _ALPHA, _NUMBERS, _NORMAL, _VALUES, _PAD_M, _FORCE, _FORCE_STD, _COVARIANCE, _VECTOR, _CLEAR
 cdef Py_ssize_t _NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID
 cdef Py_ssize_t _POSITION_UNRELIABLE, _POSITION_INVALID, _REST_SAMPLES, _MAX_STEPS, _MAX_AGM_STEPS
 cdef double _STEP_TOLERANCE, _AGM_TOLERANCE, _MAX_MISFIT, _MAX_EXPONENT, _PI, _ROOT_HALF, _NAN, _INFINITY
@@ -49,7 +49,8 @@ cdef void _write_vector(
     ShearStage stage, ShearTable table, double fx, double fy, double normal_n) noexcept
 @cython.locals(at=Py_ssize_t, axes='double[::1]', numbers='double[::1]', part=double, length=double)
 cdef void _set_axes(ShearStage stage, ShearTable table) noexcept
-cdef double _load_share(double[::1] numbers, double normal_n) noexcept
+@cython.locals(first=Py_ssize_t)
+cdef double _pressure_ratio(double[::1] numbers, Py_ssize_t channel, double x, double y) noexcept
 @cython.locals(numbers='double[::1]', i=Py_ssize_t, k=Py_ssize_t, _=Py_ssize_t, inside=bint, size=double)
 cdef bint _estimate(ShearStage stage, ShearTable table, double normal_n, double x, double y) noexcept
 @cython.locals(i=Py_ssize_t, k=Py_ssize_t, other=Py_ssize_t, mean=double, square=double, length=double)

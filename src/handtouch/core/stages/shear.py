@@ -19,7 +19,7 @@ SHEAR_CHANNELS = _CHANNELS
 """Electrodes of a shear pad: x0, xa, y0, yb."""
 _FILM, _OVERLAP, _LOST, _RADIUS, _INSET, _TRAVEL, _NOISE, _LOAD = 0, 1, 2, 3, 4, 5, 6, 7
 _STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE = 8, 10, 11, 12, 13, 14
-_LOG_GAIN, _TILT, _ALONG, _NUMBERS = 16, 20, 28, 31
+_LOG_GAIN, _LEAN, _ALONG, _ALPHA, _NUMBERS = 16, 20, 28, 31, 32
 SHEAR_NUMBERS = {
     "film_m": slice(_FILM, _FILM + 1),
     "overlap_m": slice(_OVERLAP, _OVERLAP + 1),  # of bars at rest
@@ -36,8 +36,9 @@ SHEAR_NUMBERS = {
     "zero_std_n": slice(_ZERO_STD, _ZERO_STD + 1),
     "centre_m": slice(_CENTRE, _CENTRE + 2),  # of the plate, as arc lengths on the pad
     "log_gain": slice(_LOG_GAIN, _LOG_GAIN + 4),  # of channels: current per count
-    "tilt_per_m": slice(_TILT, _TILT + 8),  # d ln(conductance) / d(centre) of channels at a high load
+    "lean_per_m": slice(_LEAN, _LEAN + 8),  # d(pressure over its mean) / d(centre) of channels
     "along": slice(_ALONG, _ALONG + 3),  # the pad's x in the link's frame
+    "alpha": slice(_ALPHA, _ALPHA + 1),  # exponent of the film's conductance over pressure
 }
 """Layout of the numbers of a `ShearTable`."""
 _VALUES, _PAD_M, _FORCE = VALUE_COUNT, VALUE_SLICES["pad_m"].start, VALUE_SLICES["force_n"].start
@@ -233,19 +234,30 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
         xx += gain[i] * gain[i] * variance
         xy += gain[i] * gain[_CHANNELS + i] * variance
         yy += gain[_CHANNELS + i] * gain[_CHANNELS + i] * variance
-    # and the centre of pressure
+    # and the centre and size of the normal force
     at = row + _COVARIANCE
-    centre_variance = 0.5 * (stage.values[at] + stage.values[at + 4] + stage.values[at + 8])
-    share = _load_share(numbers, max(normal_n, 0.0))
-    for axis in range(2):
+    std = stage.values[row + _FORCE_STD]
+    zz = std * std
+    variance = 0.5 * (stage.values[at] + stage.values[at + 4] + stage.values[at + 8])
+    x = stage.values[row + _PAD_M] - numbers[_CENTRE]
+    y = stage.values[row + _PAD_M + 1] - numbers[_CENTRE + 1]
+    load = max(normal_n, 0.0) / numbers[_LOAD]
+    for axis in range(3):
         by_x = by_y = 0.0
         for i in range(_CHANNELS):
-            slope = share * numbers[_TILT + 2 * i + axis]
+            lean = _pressure_ratio(numbers, i, x, y)
+            slope = numbers[_ALPHA] / (1.0 + load * lean)
+            if axis == 2:
+                slope *= lean / numbers[_LOAD]
+            else:
+                slope *= load * numbers[_LEAN + 2 * i + axis] if lean > 0.0 else 0.0
             by_x += gain[i] * slope
             by_y += gain[_CHANNELS + i] * slope
-        xx += by_x * by_x * centre_variance
-        xy += by_x * by_y * centre_variance
-        yy += by_y * by_y * centre_variance
+        if axis == 2:
+            variance = zz
+        xx += by_x * by_x * variance
+        xy += by_x * by_y * variance
+        yy += by_y * by_y * variance
     kx, ky = numbers[_STIFFNESS], numbers[_STIFFNESS + 1]
     common = numbers[_STIFFNESS_STD] * numbers[_STIFFNESS_STD]
     axis_variance = numbers[_AXIS_STD] * numbers[_AXIS_STD]
@@ -254,8 +266,6 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
     xx = kx * kx * xx + (common + axis_variance) * fx * fx + even
     xy = kx * ky * xy + common * fx * fy
     yy = ky * ky * yy + (common + axis_variance) * fy * fy + even
-    std = stage.values[row + _FORCE_STD]
-    zz = std * std
     _set_axes(stage, table)
     axes = stage.axes
     for i in range(3):
@@ -284,9 +294,10 @@ def _set_axes(stage: ShearStage, table: ShearTable) -> None:
     axes[2], axes[5], axes[8] = nx, ny, nz
 
 
-def _load_share(numbers: memoryview[float], normal_n: float) -> float:
-    """Return the part of the film's greatest sensitivity to pressure that it has under a load."""
-    return normal_n / (numbers[_LOAD] + normal_n)
+def _pressure_ratio(numbers: memoryview[float], channel: int, x: float, y: float) -> float:
+    """Return the pressure at a channel over its mean, of a force at (x, y) from the plate's centre."""
+    first = _LEAN + 2 * channel
+    return max(1.0 + numbers[first] * x + numbers[first + 1] * y, 0.0)
 
 
 def _estimate(stage: ShearStage, table: ShearTable, normal_n: float, x: float, y: float) -> bool:
@@ -295,12 +306,12 @@ def _estimate(stage: ShearStage, table: ShearTable, normal_n: float, x: float, y
     normal_n, x, y: force on the pad and its centre from the plate's. Return False where no displacement
     within the travel has such currents.
     """
-    numbers, share = table.numbers, _load_share(table.numbers, normal_n)
-    travel = numbers[_TRAVEL]
+    numbers = table.numbers
+    travel, load = numbers[_TRAVEL], normal_n / numbers[_LOAD]
     for i in range(_CHANNELS):
         if not stage.counts[i] > 0.0:
             return False
-        tilt = share * (numbers[_TILT + 2 * i] * x + numbers[_TILT + 2 * i + 1] * y)
+        tilt = numbers[_ALPHA] * math.log(1.0 + load * _pressure_ratio(numbers, i, x, y))
         stage.logs[i] = math.log(stage.counts[i]) + numbers[_LOG_GAIN + i] - tilt
     for k in range(_UNKNOWNS):
         stage.motion[k] = 0.0
