@@ -30,17 +30,23 @@ class Held:
         self._ids = np.arange(1, pads + 1, dtype=np.uint32)
         self.slip = SlipDetector(PERIOD_NS * 1e-9, self._values, self._current_a, self._times, self._ids)
         self.slip.set_requested(np.ones(pads, dtype=np.bool_))
-        self.poses = ContactBuffer(pads, length=12)
+        self.poses = ContactBuffer(pads, length=22)
         self.reporter = MotionReporter(self.slip, self.poses, PERIOD_NS * 1e-9)
         self._rng = np.random.default_rng(seed)
         self._k = 0
 
     def feel(
-        self, seconds: float, along_m: Way, force: Way = lambda _: 2.0, links_m: Sequence[Way] = ()
+        self,
+        seconds: float,
+        along_m: Way,
+        force: Way = lambda _: 2.0,
+        links_m: Sequence[Way] = (),
+        turns_rad: Way = lambda _: 0.0,
     ) -> list[PerceptEstimate]:
         """Play contacts and return the percepts of the first pad.
 
-        along_m: the first pad's centroid; links_m: of links, along x in the palm.
+        along_m: the first pad's centroid; links_m: of links, along x in the palm; turns_rad: of the first
+        link, about y, while its point in contact moves as the centroid does.
         """
         percepts = []
         pads = np.arange(len(self._ids))
@@ -55,7 +61,11 @@ class Held:
             self._current_a[:] = 1e-3 * force(t_s)
             self.slip.detect_slips(pads)
             if links_m:
-                self.poses.add_samples(self._posed(place, [way(t_s) for way in links_m]))
+                posed = self._posed(place, [way(t_s) for way in links_m])
+                turn = turns_rad(t_s)
+                c, s = np.cos(turn), np.sin(turn)
+                posed["palm_rotation"][0] = [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+                self.poses.add_samples(posed)
             found = self.reporter.report_contacts(pads, int(self._times[0]))
             percepts += [percept for percept in found if percept.pad == 0]
         return percepts
@@ -64,7 +74,8 @@ class Held:
         pads = np.arange(len(place))
         sample = ContactSamples(pads, self._times.copy(), self._ids)
         on_link = np.hstack([place, np.zeros((len(pads), 1))])
-        sample["position_m"] = on_link
+        sample["position_m"], sample["pad_m"] = on_link, place
+        sample["total_current_a"] = self._current_a
         link = np.zeros((len(pads), 3))
         link[:, 0] = links_m
         link[:, 1] = 0.03 * pads
@@ -151,6 +162,14 @@ def test_joint_states_distinguish_rolling_from_sliding() -> None:
     assert slides.probabilities["sliding"] > 0.95
     relative = slides.values["relative_velocity_m_per_s"]
     assert relative == pytest.approx([-15e-3, 0.0, 0.0], abs=3e-3)
+
+
+def test_link_that_turns_rolls_and_one_that_moves_against_the_object_slides() -> None:
+    """The same centroid on a pad: its link turns and its surface stays on the object, or it is moved."""
+    rolls = Held(4).feel(1.3, ramp(1.0, 4e-3), links_m=[still] * 4, turns_rad=ramp(1.0, 0.5))
+    assert not {"sliding", "incipient"} & {percept.label for percept in rolls}
+    slides = Held(4).feel(1.3, ramp(1.0, 4e-3), links_m=[ramp(1.0, -30e-3), still, still, still])
+    assert "sliding" in {percept.label for percept in slides}
 
 
 def test_moving_hand_with_its_object_does_not_slide() -> None:

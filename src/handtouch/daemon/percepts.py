@@ -25,6 +25,7 @@ from handtouch.percept.messages import make_percept_message
 from handtouch.percept.motion import MotionReporter
 from handtouch.percept.relative_motion import VELOCITY_WINDOW_S
 from handtouch.percept.samples import ContactBuffer, ContactSamples
+from handtouch.percept.slip_evidence import FEATURE_WINDOW_S
 
 
 class PerceptPublisher:
@@ -53,9 +54,8 @@ class PerceptPublisher:
         for hand, rows in enumerate(pipeline.model.rows_of_hand.values()):
             hand_index[rows] = hand
         period_s = pipeline.cycle.period_ns * 1e-9
-        self._poses = ContactBuffer(
-            pipeline.model.size, hand_index.tolist(), length=round(VELOCITY_WINDOW_S / period_s) + 2
-        )
+        length = round(max(VELOCITY_WINDOW_S, FEATURE_WINDOW_S) / period_s) + 2
+        self._poses = ContactBuffer(pipeline.model.size, hand_index.tolist(), length)
         """latest poses of links in the palm frame"""
         self._motion = MotionReporter(pipeline.tick.slip, self._poses, period_s)
 
@@ -96,7 +96,8 @@ class PerceptPublisher:
             return
         sample = ContactSamples(rows, tick.columns.sample_ns[rows], tick.contacts.id[rows])
         placed, rotation, _, joints_m2 = transforms.in_palm(rows)
-        sample["position_m"] = tick.columns.position_m[rows]
+        sample["position_m"], sample["pad_m"] = tick.columns.position_m[rows], tick.columns.pad_m[rows]
+        sample["total_current_a"] = tick.columns.total_current_a[rows]
         sample["palm_position_m"], sample["palm_normal"] = placed[:, :3], placed[:, 3:6]
         sample["palm_rotation"], sample["palm_joints_m2"] = rotation, joints_m2
         self._poses.add_samples(sample)

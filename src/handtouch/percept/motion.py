@@ -1,10 +1,10 @@
 """Percept `motion`: sticking, incipient slip, sliding, rolling or lift-off of every contact.
 
-The slip stage of the core detects whether a centroid has begun to move. Once it moves, joint states
-distinguish sliding from rolling: the surfaces' relative velocity is that of the link's material less that of
-the object, which is a rigid body held by the hand's other sticking contacts, or static in the palm frame
-without any. Without joint states a moving centroid counts as sliding, with a fixed prior probability of
-rolling.
+The slip stage of the core detects whether a centroid has begun to move. Without joint states a moving
+centroid counts as sliding, with a fixed prior probability of rolling. With joint states of several contacts
+of a hand `handtouch.percept.slip_evidence` computes the odds of slip from the motion of centroid and links;
+and a contact slides, too, whose link moves against the object by more than the joints' deviations explain:
+the object is a rigid body held by the hand's other sticking contacts.
 
 Public names: `MotionReporter`, `slip_probability`.
 """
@@ -21,6 +21,7 @@ from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.slip import MOTION_CLASSES, SLIP_SLICES
 from handtouch.percept.relative_motion import LinkMotions, RelativeMotion, relative_to_object
 from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
+from handtouch.percept.slip_evidence import SlipTrees, slip_features
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +30,9 @@ _MIN_SAMPLES = 4  # of a contact, before which its motion is undetermined
 _REPORT_PERIOD_NS = 50_000_000
 _LIFT_OFF_HORIZON_S, _FORCE_RATE_TIME_S = 0.04, 0.02  # as in the slip stage
 _MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
+_EVIDENCE_PERIOD_NS = 5_000_000
+_MIN_SLIDING_PROBABILITY = 0.8  # of slip by joint states, while the centroid isn't known to move
+_MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
 
 
 class MotionReporter:
@@ -40,6 +44,10 @@ class MotionReporter:
     def __init__(self, slip: SlipDetector, poses: ContactBuffer, period_s: float) -> None:
         n = len(slip.contact_id)
         self._slip, self._poses, self._period_s = slip, poses, period_s
+        self._trees = SlipTrees.shipped()
+        self._log_odds = np.full(n, np.nan)
+        """ln of the odds of slip by joint states, NaN without"""
+        self._evidence_ns = np.zeros(n, dtype=np.int64)
         self._last_report_ns = np.zeros(n, dtype=np.int64)
         self._detected_label = np.zeros(n, dtype=np.intp)
         self._reported_contact = np.zeros(n, dtype=np.uint32)
@@ -54,6 +62,9 @@ class MotionReporter:
         self._reported_contact[fresh] = slip.contact_id[fresh]
         self._detected_label[fresh] = -1
         self._last_report_ns[fresh] = 0
+        self._log_odds[fresh] = np.nan
+        self._evidence_ns[fresh] = 0
+        self._update_evidence(pads, now_ns)
         due = self._pads_to_report(pads, now_ns)
         if not len(due):
             return []
@@ -68,9 +79,32 @@ class MotionReporter:
 
     # Details ----------------------------------------------------------------------------------------------
 
+    def _update_evidence(self, pads: IntArray, now_ns: int) -> None:
+        """Update the odds of slip by joint states, of contacts on hands that touch with several pads."""
+        placed = np.isfinite(self._poses.latest_field(pads, "palm_position_m")[:, 0])
+        placed &= self._poses.sample_count[pads] > 0
+        hand = self._poses.hand_index[pads]
+        placed &= np.bincount(hand[placed], minlength=int(hand.max()) + 1)[hand] > 1
+        self._log_odds[pads[~placed]] = np.nan
+        pads = pads[placed & (now_ns - self._evidence_ns[pads] >= 0.9 * _EVIDENCE_PERIOD_NS)]
+        if not len(pads):
+            return
+        features = slip_features(self._poses, self._slip, pads, self._period_s)
+        passed_s = (now_ns - self._evidence_ns[pads]) * 1e-9
+        kept = np.nan_to_num(self._log_odds[pads], nan=_MIN_LOG_ODDS) - passed_s / _ODDS_DECAY_S
+        self._log_odds[pads] = np.maximum(self._trees.log_odds(features), kept)
+        self._evidence_ns[pads] = now_ns
+
+    def _labels(self, pads: IntArray) -> IntArray:
+        """Return numbers (k,) that change with the class of a contact."""
+        with np.errstate(invalid="ignore"):
+            slips = self._log_odds[pads] > 0
+        known = len(MOTION_CLASSES) * (slips + 2 * np.isfinite(self._log_odds[pads]))
+        return np.asarray(self._slip.column("label")[pads].astype(np.intp) + known)
+
     def _pads_to_report(self, pads: IntArray, now_ns: int) -> IntArray:
         """Return the pads whose class changed, and some of those whose report period has passed."""
-        changed = self._slip.column("label")[pads] != self._detected_label[pads]
+        changed = self._labels(pads) != self._detected_label[pads]
         waits = now_ns - self._last_report_ns[pads]
         due = np.flatnonzero((waits >= _REPORT_PERIOD_NS) & ~changed)
         few = math.ceil(1.25 * len(pads) * self._period_s * 1e9 / _REPORT_PERIOD_NS)
@@ -84,7 +118,7 @@ class MotionReporter:
         relative = relative_to_object(links, pad, self._poses.hand_index, uncertain)
         probabilities = self._class_probabilities(pad, relative)
         self._last_report_ns[pad] = now_ns
-        self._detected_label[pad] = int(slip.column("label")[pad])
+        self._detected_label[pad] = int(self._labels(np.array([pad]))[0])
         return self._percept(pad, now_ns, probabilities, relative)
 
     def _class_probabilities(self, pad: int, relative: RelativeMotion | None) -> dict[str, float]:
@@ -96,6 +130,16 @@ class MotionReporter:
         slips = 1.0 if slipping else slip_probability(log_odds)
         leaves = _lift_off_probability(force_n, rate_n_per_s)
         stays = 1 - leaves
+        if math.isfinite(by_joints := float(self._log_odds[pad])):
+            slips = slip_probability(by_joints)
+            if relative is not None:
+                slips = max(slips, relative.sliding_at_rest_probability)
+            sure = bool(slipping) or slips > _MIN_SLIDING_PROBABILITY
+            rolls = stays * (1 - slips) if slipping else 0.0
+            found = (
+                stays * (1 - slips) - rolls, stays * slips * (not sure), stays * slips * sure, rolls, leaves,
+            )  # fmt: skip
+            return dict(zip(MOTION_CLASSES, map(float, found), strict=True))
         slides = (1 - _ROLLING_PRIOR) if relative is None else relative.sliding_probability
         runs = stays * slips if slipping else 0.0
         still = stays * (1 - slips)
