@@ -14,6 +14,7 @@ from handtouch.simulate.truth import read_records
 
 MIN_SAMPLES = 25
 """Valid force vectors of each fingertip to wait for."""
+FINGERTIPS = {"thumb_distal", "index_distal", "middle_distal", "ring_distal"}
 PULLED = """
 repeat = true
 pause_s = 0.3
@@ -48,6 +49,53 @@ def pulled(rig: Any) -> Any:
     rig.simulate("--world", "ideal", "--truth", str(rig.folder / "truth"))
     rig.start("run")
     return rig
+
+
+@pytest.fixture
+def grasping(rig: Any) -> Any:
+    """A daemon, and the nodes of the shipped hand with such fingertips, which grasps a ball in MuJoCo."""
+    pytest.importorskip("mujoco", reason="the extra isn't installed: pip install 'handtouch[mujoco]'")
+    settings = "\n".join(f'{stream} = "{endpoint}"' for stream, endpoint in rig.endpoints.items())
+    text = shipped.path("utah_mit_shear.toml").read_text()
+    text = text.replace("[daemon]\n", f"[daemon]\n{settings}\nsupervise = false\n", 1)
+    text = text.replace("sync_period_ms = 5.0", "sync_period_ms = 50.0", 1)
+    text = text.replace("heartbeat_timeout_ms = 350", "heartbeat_timeout_ms = 1500")
+    text = text.replace('"utah_mit.urdf"', f'"{shipped.path("utah_mit.urdf")}"', 1)
+    rig.config.write_text(text)
+    rig.start("simulate", "--grasp", "ball", "--world", "ideal", "--truth", str(rig.folder / "truth"))
+    rig.start("run")
+    return rig
+
+
+def test_fingertips_of_a_grasping_hand_report_mujocos_tangential_forces(grasping: Any) -> None:
+    contacts: list[wire.Contact] = []
+    with grasping.subscribe("contact/*/*", "percept/right/friction") as messages:
+        ratios = 0
+        while len(contacts) < 3 * MIN_SAMPLES or not ratios:
+            message = messages.recv(120)
+            assert message is not None, grasping.all_printed()
+            if isinstance(message, wire.Percept):
+                ratios += message.state == "estimated" and "ratio" in message.values
+            elif message.event == "update" and message.fresh and message.force_vector_n is not None:
+                contacts.append(message)
+    assert grasping.end("simulate") == 0, grasping.all_printed()
+    truth = {(record.link, record.t_ns): record for record in read_records(grasping.folder / "truth")}
+    times = np.array(sorted({t_ns for _, t_ns in truth}))
+    errors_n, pulls_n = [], []
+    for contact in contacts:
+        nearest = int(times[np.abs(times - contact.t_ns).argmin()])
+        if (true := truth.get((contact.link, nearest))) is None or abs(nearest - contact.t_ns) > 10_000_000:
+            continue
+        assert contact.force_vector_n is not None
+        assert true.force_vector_n is not None
+        across = np.eye(3) - np.outer(true.normal, true.normal)
+        errors_n.append(across @ np.subtract(contact.force_vector_n, true.force_vector_n))
+        pulls_n.append(across @ true.force_vector_n)
+    assert len(errors_n) > MIN_SAMPLES
+    assert {contact.link for contact in contacts} <= FINGERTIPS
+    errors, pulls = np.linalg.norm(errors_n, axis=1), np.linalg.norm(pulls_n, axis=1)
+    assert np.median(pulls) > 0.1
+    assert np.median(errors) < 0.25 * np.median(pulls)
 
 
 def test_a_subscriber_sees_the_force_vectors_of_touches(pulled: Any) -> None:
