@@ -257,9 +257,9 @@ HEAD = """\
 "of fingers", which follow from how they differ."""
 PAIRS = """\
 Two touches at once on the pad with six electrodes, {low:g} to {high:g} N each, at uniform positions from 5 %
-of a side inside its edges; parts of the first {fingers} fingers, sheets without creep and hysteresis, for which forces
-of two contacts aren't compensated. Reported at a false-alarm rate of 0.1 %; of the {touches} single touches
-above {false} were reported as two. Intervals are of fingers."""
+of a side inside its edges; parts of the first {fingers} fingers, sheets without creep and hysteresis, for
+which forces of two contacts aren't compensated. Reported at a false-alarm rate of 0.1 %; of the {touches}
+single touches above {false} were reported as two. Intervals are of fingers."""
 
 
 if __name__ == "__main__":
