@@ -38,15 +38,15 @@ GUM_MM = 3.0
 """Bound of the distance of gum from where it is."""
 
 
-def play_all(workers: int, journal: Path | None, quick: bool) -> list[Episode]:
-    """Play the episodes of all cases; results in a journal aren't computed again."""
+def play_all(workers: int, journal: Path | None, share: float) -> list[Episode]:
+    """Play a share of the episodes of each case; results in a journal aren't computed again."""
     lines = journal.read_text().splitlines() if journal and journal.exists() else []
     found: list[Episode] = [json.loads(line) for line in lines]
     done = {(it["case"], it["name"], it["number"]) for it in found}
     tasks = [
         (index, name, number)
         for index, case in enumerate(CASES)
-        for name, number in (case.episodes[:1] if quick else case.episodes)
+        for name, number in case.episodes[: max(1, round(share * len(case.episodes)))]
         if (case.name, name, number) not in done
     ]
     with multiprocessing.get_context("fork").Pool(workers) as pool:
@@ -251,9 +251,12 @@ NOTES = {
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="of the episodes that are played (default: 1)"
+    )
     parser.add_argument("--journal", type=Path, help="file to keep results in")
     asked = parser.parse_args()
-    episodes = play_all(asked.workers, asked.journal, asked.quick)
+    episodes = play_all(asked.workers, asked.journal, 0.0 if asked.quick else asked.share)
     tables = {
         "By case": [row(of_case(episodes, case.name), case=case.name) for case in CASES],
         "Gum on S1 and S2": gum_rows(episodes),

@@ -77,19 +77,19 @@ def _planes(x_mm: float, y_mm: float) -> Callable[[np.random.Generator], config.
 _DEFAULT = WORLDS["default"]
 _DRIFTING = replace(_DEFAULT, electronics=WORLDS["harsh"].electronics)
 CASES = (
-    Case("gum, sheets S1", world_with(_DEFAULT, sheet="S1"), ("gum",), 24),
-    Case("gum, sheets S2", world_with(_DEFAULT, sheet="S2"), ("gum",), 24),
-    Case("moisture", _DEFAULT, ("moisture",), 12),
-    Case("loose electrode", _DEFAULT, ("loose electrode",), 12),
-    Case("two faults on two pads", _DEFAULT, ("two pads",), 12),
-    Case("two faults on one pad", _DEFAULT, ("one pad",), 12),
-    Case("drift of `harsh`", _DRIFTING, PLAYED, 2),
-    Case("drift of `harsh`, no fault", _DRIFTING, ("plain use",), 12),
-    Case("series resistors", _DEFAULT, (*PLAYED, "shorted pair"), 2, with_resistors),
-    Case("series resistors, no fault, centre lines", _DEFAULT, ("centre lines",), 32, with_resistors),
-    Case("small pads, 10 x 10 mm", _DEFAULT, PLAYED, 2, _planes(10.0, 10.0)),
-    Case("long pads, 60 x 20 mm", _DEFAULT, PLAYED, 2, _planes(60.0, 20.0)),
-    Case("mended", _DEFAULT, PLAYED, 2, length_s=480.0, is_mended=True),
+    Case("gum, sheets S1", world_with(_DEFAULT, sheet="S1"), ("gum",), 48),
+    Case("gum, sheets S2", world_with(_DEFAULT, sheet="S2"), ("gum",), 48),
+    Case("moisture", _DEFAULT, ("moisture",), 24),
+    Case("loose electrode", _DEFAULT, ("loose electrode",), 24),
+    Case("two faults on two pads", _DEFAULT, ("two pads",), 24),
+    Case("two faults on one pad", _DEFAULT, ("one pad",), 24),
+    Case("drift of `harsh`", _DRIFTING, PLAYED, 4),
+    Case("drift of `harsh`, no fault", _DRIFTING, ("plain use",), 24),
+    Case("series resistors", _DEFAULT, (*PLAYED, "shorted pair"), 4, with_resistors),
+    Case("series resistors, no fault, centre lines", _DEFAULT, ("centre lines",), 64, with_resistors),
+    Case("small pads, 10 x 10 mm", _DEFAULT, PLAYED, 4, _planes(10.0, 10.0)),
+    Case("long pads, 60 x 20 mm", _DEFAULT, PLAYED, 4, _planes(60.0, 20.0)),
+    Case("mended", _DEFAULT, PLAYED, 4, length_s=480.0, is_mended=True),
 )
 
 
