@@ -70,6 +70,7 @@ def print_status(answer: dict[str, Any], console: Console) -> None:
     _print_pads(answer["pads"], console)
     _print_supervisor(answer, console)
     _print_rejected_adaptation(answer, console)
+    _print_failed_shear_channels(answer, console)
     percepts = service.get("percepts")
     if percepts is not None and (percepts["state"] != "stopped" or percepts["restarts"]):
         text = f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped"
@@ -169,6 +170,14 @@ def _print_rejected_adaptation(answer: dict[str, Any], console: Console) -> None
     if rejected := [pad["link"] for pad in answer["pads"] if pad.get("adaptation_status") == "rejected"]:
         text = f"adaptation not compensated, as steady holds drift less without: {', '.join(rejected)}"
         console.print(text, highlight=False, markup=False)
+
+
+def _print_failed_shear_channels(answer: dict[str, Any], console: Console) -> None:
+    """Print the pads whose shear pad has a failed channel."""
+    for pad in answer["pads"]:
+        if (status := pad.get("shear_status", "")) in ("dead", "saturated", "shorted"):
+            text = f"{pad['hand']}/{pad['link']}: channels of the shear pad {status}; check its leads"
+            console.print(text, highlight=False, markup=False, style="yellow")
 
 
 def _calibration_note(pad: dict[str, Any]) -> str:

@@ -72,6 +72,10 @@ class ShearForces:
         """Return True if there is a shear pad beneath a pad."""
         return pad in self._numbers
 
+    def rest_known(self, pad: int) -> bool:
+        """Return True if the rest position of the shear pad beneath a pad is known."""
+        return bool(np.isfinite(self._state.shear_rest_m[pad]).all())
+
     def update_forces(self, slab: Slab) -> None:
         """Compute the force vectors of contacts, once position and force of a tick's contacts are known."""
         self._stage.update_forces(slab.memory)

@@ -25,12 +25,14 @@ from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent
 from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
+from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.percept_client import PerceptClient
 from handtouch.daemon.publisher import Publisher
+from handtouch.daemon.shear_channels import ShearChannels
 from handtouch.daemon.stage_timer import StageTimer
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.wire import AdaptationStatusName, NodeStateName, PadState
+from handtouch.wire import AdaptationStatusName, NodeStateName, PadState, ShearStatusName
 
 _SECOND_NS = 1_000_000_000
 _HEALTH_PERIOD_NS = round(wire.HEALTH.period_s * _SECOND_NS)
@@ -112,6 +114,7 @@ class StatusReporter:
         self._sample_rate_hz = np.zeros(n)
         self._rates_hz: dict[str, float] = {}
         self._rejected_adaptation = np.zeros(n, dtype=np.bool_)
+        self._shear_channels = ShearChannels()
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
         self._logged_problems = dict.fromkeys(ports, "")  # of each bus, without digits
@@ -315,6 +318,7 @@ class StatusReporter:
             error_register=status.error_register,
             error_history=status.error_history,
             adaptation_status=self._adaptation_status(pad),
+            shear_status=self._shear_status(pad, touched=state == PadState.TOUCHED),
             **(self.supervisor.health_fields(pad) if self.supervisor is not None else {}),
         )
 
@@ -323,6 +327,20 @@ class StatusReporter:
         if not sheet_force.modelled[pad]:
             return ""
         return "rejected" if self._rejected_adaptation[pad] else "compensated"
+
+    def _shear_status(self, pad: int, *, touched: bool) -> ShearStatusName:
+        tick = self._pipeline.tick
+        sample_ns = int(tick.columns.sample_ns[pad])
+        for shear in tick.model.shear_pads:
+            if shear.pad == pad:
+                columns = slice(shear.column, shear.column + SHEAR_CHANNELS)
+                counts = tick.channel_counts[pad, columns]
+                saturated = self._pipeline.slab.saturated(tick.channel_counts)[pad, columns]
+                noise, known = float(tick.model.noise_counts[pad]), tick.shear.rest_known(pad)
+                return self._shear_channels.update(
+                    pad, sample_ns, counts, saturated, noise, touched=touched, rest_known=known
+                )
+        return ""
 
     def _disabled_reason(self, pad: int) -> str:
         by = self._disabled_by.get(pad)

@@ -31,7 +31,13 @@ from handtouch.wire.contact import (
     PerceptKind,
     Vector3,
 )
-from handtouch.wire.health import AdaptationStatusName, Health, JointPositions, NodeStateName
+from handtouch.wire.health import (
+    AdaptationStatusName,
+    Health,
+    JointPositions,
+    NodeStateName,
+    ShearStatusName,
+)
 from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
@@ -88,6 +94,7 @@ __all__ = [
     "Raw",
     "SequenceTracker",
     "Service",
+    "ShearStatusName",
     "StateSnapshot",
     "TickInputs",
     "Topic",

@@ -14,6 +14,7 @@ NodeStateName = Literal[
 ]
 CalibrationStateName = Literal["default", "calibrated", "quarantined", "manual_required", ""]
 AdaptationStatusName = Literal["compensated", "rejected", ""]
+ShearStatusName = Literal["operational", "no_rest", "dead", "saturated", "shorted", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,11 @@ class Health:
     adaptation_status: AdaptationStatusName = ""
     """adaptation of the sheet in `force_n`: `compensated`; `rejected`: not compensated on this pad, because
     forces of steady holds drift less without; absent where sheet behaviour isn't modelled"""
+    shear_status: ShearStatusName = ""
+    """channels of the shear pad beneath: `operational`; `no_rest`: its rest position isn't known yet;
+    `dead`: a channel has almost no current; `saturated`: one is at the end of its range; `shorted`: two have
+    had equal currents, also under touches. Absent without a shear pad. Force vectors are `invalid` or
+    `unreliable` unless it is `operational`, but for `shorted`, whose component reads 0"""
     calibration_state: CalibrationStateName = ""
     """`default`: the deployment's values; `calibrated`; `quarantined`: not relied on after its node was
     replaced; `manual_required`: automatic calibration failed. This and the following are absent where
