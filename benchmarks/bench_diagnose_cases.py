@@ -44,13 +44,16 @@ def play_all(workers: int, journal: Path | None, share: float) -> list[Episode]:
     found: list[Episode] = [json.loads(line) for line in lines]
     done = {(it["case"], it["name"], it["number"]) for it in found}
     tasks = [
-        (index, name, number)
+        (rank / len(case.episodes), (index, *episode))
         for index, case in enumerate(CASES)
-        for name, number in case.episodes[: max(1, round(share * len(case.episodes)))]
-        if (case.name, name, number) not in done
+        for rank, episode in enumerate(case.episodes[: max(1, round(share * len(case.episodes)))])
+        if (case.name, *episode) not in done
     ]
+    tasks = sorted(tasks)  # all cases side by side, so that a journal has a share of each
     with multiprocessing.get_context("fork").Pool(workers) as pool:
-        for number, result in enumerate(pool.imap_unordered(play_case, tasks, chunksize=1), 1):
+        for number, result in enumerate(
+            pool.imap_unordered(play_case, [task for _, task in tasks], chunksize=1), 1
+        ):
             found.append(result)
             if journal:
                 with journal.open("a") as file:
