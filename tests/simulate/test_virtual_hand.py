@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from handtouch import config
+from handtouch.config import shipped
 from handtouch.field.contact_law import contact_stack_resistance
-from handtouch.hand import electrode_network, mount_transform, pad_surface
+from handtouch.hand import electrode_network, mount_transform, pad_network, pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
@@ -48,6 +49,10 @@ def test_currents_agree_with_exact_theory_on_an_outline(deployment: config.Deplo
     check_currents(deployment.model_copy(update={"hands": (hand,)}), pad.link, 3e-3)
 
 
+def test_currents_agree_with_exact_theory_on_an_l_shaped_palm_with_eight_electrodes() -> None:
+    check_currents(config.load(shipped.path("l_palm.toml")), "palm", 3e-3)
+
+
 def test_currents_agree_with_exact_theory_for_unequal_gaps(deployment: config.Deployment) -> None:
     pad, *others = deployment.hands[0].pads
     pad = pad.model_copy(update={"gap_offsets_mm": ((2.0, 0.0), (0.5, 1.5), (0.0, 3.0), (1.0, 0.0))})
@@ -61,7 +66,7 @@ def check_currents(deployment: config.Deployment, link: str, tolerance: float = 
     (true,) = hand.truth(10.0)
     pad = next(pad for pad in deployment.hands[0].pads if pad.link == link)
     sheet, surface = deployment.sheets[pad.sheet], pad_surface(pad)
-    network = electrode_network(pad, sheet)
+    network = pad_network(pad, sheet)
     x, y = surface.to_rectangle(true.u_m, true.v_m)
     radius_m = sheet.contact_radius_mm * 1e-3
     if sheet.hertz_force_n is not None:

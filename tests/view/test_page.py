@@ -29,6 +29,7 @@ from handtouch.field.surface import (
     SphereSurface,
     Surface,
 )
+from handtouch.hand import pad_surface
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import BodyShape, read_urdf
 from handtouch.view.page.meshes import body_mesh, outline_m, pad_mesh
@@ -127,6 +128,14 @@ def test_an_unrolled_pad_preserves_length_and_area(surface: Surface) -> None:
     unrolled = abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2
     assert unrolled == pytest.approx(area, rel=0.12)  # the surface is drawn a little above itself
     assert np.ptp(x) == pytest.approx(float(surface.from_rectangle(surface.a, surface.b / 2)[0]))
+
+
+def test_an_l_shaped_pad_is_drawn_with_its_re_entrant_corner() -> None:
+    (entry,) = config.load(shipped.path("l_palm.toml")).pads
+    x, y = 1e3 * outline_m(pad_surface(entry.pad)).T
+    assert abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2 == pytest.approx(52 * 18 + 24 * 22, rel=0.01)
+    middle = np.array([(x.min() + x.max()) / 2 - 2, (y.min() + y.max()) / 2 - 2])  # of the vertex (24, 18)
+    assert np.hypot(x - middle[0], y - middle[1]).min() < 1.0
 
 
 def test_link_poses_agree_with_the_kinematics() -> None:

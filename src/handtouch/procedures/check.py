@@ -114,7 +114,7 @@ def _pad_warnings(name: str, pad: config.Pad, deployment: config.Deployment) -> 
     a, b = pad.surface.rectangle_mm
     sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
     touch = pad.touch or deployment.touch
-    if max(a / b, b / a) > MAX_USUAL_ASPECT:
+    if not pad.arcs_mm and max(a / b, b / a) > MAX_USUAL_ASPECT:  # electrodes on arcs are anywhere
         long, short = ("x", "y") if a > b else ("y", "x")
         yield (
             f"{name}: {max(a / b, b / a):.1f} times longer along {long} than along {short}: the far "
