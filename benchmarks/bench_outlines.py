@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
+import tempfile
 import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import matplotlib
@@ -22,7 +25,16 @@ from skfem import ElementTriP2, ElementTriP3, ElementTriP4
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
-from handtouch.field import BoundaryElectrode, ElectrodeNetwork, Outline, OutlineNetwork
+from handtouch.field import (
+    BoundaryElectrode,
+    ElectrodeNetwork,
+    MeshNetwork,
+    Outline,
+    OutlineNetwork,
+    read_stl,
+)
+from handtouch.field.outline_surface import OutlineSurface
+from handtouch.hand import pad_network, pad_surface
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -38,6 +50,7 @@ INSET = 0.01  # of the larger extent: least distance of points from the boundary
 POINTS = 400
 NOISE = 0.01  # of the total, on each channel
 INFORMATION_MARGIN = 0.1  # of the extent
+STL_ELECTRODES_DEG = ((52.5, 172.5), (187.5, 307.5), (322.5, 397.5))  # from vertex to vertex
 COST_ELECTRODES, COST_CONTACTS = (3, 4, 6, 8, 12, 16), 2000
 OUTLINE_MM = 56.548  # of the fingertip in config/electrodes.toml
 GAP_SHARE = 0.1  # of the pitch of the electrodes
@@ -167,13 +180,86 @@ def closed_forms() -> list[Row]:
     return rows
 
 
-def elements(quick: bool) -> list[Row]:
-    """An L with a square hole against the finite elements of the tests, refined."""
-    spec = importlib.util.spec_from_file_location("fem", ROOT / "tests" / "field" / "test_outline_fem.py")
+def surfaces(quick: bool) -> list[Row]:
+    """A round fingertip: a disc on a sphere, by the daemon's model and from an STL file of its triangles.
+
+    Stereographic projection keeps the fractions of a flat disc, whose closed form is in `closed_forms`.
+    """
+    tests = _load_test_module("test_mesh_network")
+    (tip, *_) = load(shipped.path("electrodes.toml")).pads
+    surface, sheet = pad_surface(tip.pad), load(shipped.path("electrodes.toml")).sheets[tip.pad.sheet]
+    assert isinstance(surface, OutlineSurface)
+    network, radius_m = pad_network(tip.pad, sheet), 9e-3
+    sphere = 12.0 / 9.0  # radius of the ball over that of the drawing
+    exact = OutlineNetwork(
+        Outline.circle(1.0),
+        [BoundaryElectrode(begin / 9.0 % math.tau, end / 9.0 % math.tau) for begin, end in tip.pad.arcs_mm],
+        1000.0,
+        tolerance=REFERENCE_TOLERANCE,
+    )
+    rng = np.random.default_rng(1)
+    at = 0.9 * np.sqrt(rng.uniform(size=POINTS)) * np.exp(2j * np.pi * rng.uniform(size=POINTS))
+    expected = exact.fractions(at.real + 1, at.imag + 1)
+    drawn = network.fractions(*surface.to_rectangle(radius_m * (at.real + 1), radius_m * (at.imag + 1)))
+    rows: list[Row] = [
+        {
+            "model": "outline_on_sphere of the daemon",
+            "triangles": "-",
+            "edge over extent, %": "-",
+            "conductance": float(np.abs(network.conductance - exact.conductance).max()),
+            "fractions": float(np.abs(drawn - expected).max()),
+        }
+    ]
+    angles = np.radians(STL_ELECTRODES_DEG)
+    exact = OutlineNetwork(
+        Outline.circle(1.0),
+        [BoundaryElectrode(float(begin), float(end)) for begin, end in angles % math.tau],
+        1000.0,
+        tolerance=REFERENCE_TOLERANCE,
+    )
+    expected = exact.fractions(at.real + 1, at.imag + 1)
+    ends = tests.lifted(np.stack([np.cos(angles), np.sin(angles)], axis=-1).reshape(-1, 2), 2 * sphere)
+    points_m = tests.lifted(np.stack([at.real, at.imag], axis=1), 2 * sphere)
+    for rings in (8,) if quick else (8, 16, 32, 64):
+        flat, triangles = tests.disc(rings)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "fingertip.stl"
+            _write_stl(path, tests.lifted(flat, 2 * sphere), triangles)
+            points, found = read_stl(path)
+        pairs = [(tests.as_point(a), tests.as_point(b)) for a, b in ends.reshape(-1, 2, 3)]
+        pad = MeshNetwork(points, found, pairs, 1000.0)
+        inside = points_m[:, :2] - points[:, :2].min(axis=0)
+        rows.append(
+            {
+                "model": "STL file",
+                "triangles": len(found),
+                "edge over extent, %": 50.0 / rings,
+                "conductance": float(np.abs(pad.conductance - exact.conductance).max()),
+                "fractions": float(np.nanmax(np.abs(pad.fractions(*inside.T) - expected))),
+            }
+        )
+    progress("surfaces")
+    return rows
+
+
+def _write_stl(path: Path, points: FloatArray, triangles: NDArray[np.intp]) -> None:
+    records = np.zeros(len(triangles), [("n", "<f4", 3), ("c", "<f4", (3, 3)), ("a", "<u2")])
+    records["c"] = points[triangles]
+    path.write_bytes(b"fingertip".ljust(80) + np.uint32(len(triangles)).tobytes() + records.tobytes())
+
+
+def _load_test_module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tests" / "field" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
-    fem = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(fem)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def elements(quick: bool) -> list[Row]:
+    """An L with a square hole against the finite elements of the tests, refined."""
+    fem = _load_test_module("test_outline_fem")
     outline, pad = fem.pad_with_hole()
     fractions = pad.fractions(*fem.POINTS)
     rows = []
@@ -312,7 +398,8 @@ def draw(path: Path, accuracy: list[Row], bound: list[Row]) -> None:
 def main() -> None:
     quick = options(__doc__).parse_args().quick
     known, accuracy = closed_forms(), convergence(quick)
-    mesh, bound, cost = elements(quick), information(quick), costs(quick)
+    mesh, curved = elements(quick), surfaces(quick)
+    bound, cost = information(quick), costs(quick)
     page = [
         "# Pads of any outline",
         "",
@@ -338,6 +425,14 @@ def main() -> None:
             mesh,
         ),
         *table(
+            "A fingertip on a sphere",
+            "A disc of 18 mm on a ball of 12 mm radius: the pad with three electrodes of "
+            "config/electrodes.toml, and an STL file of triangles whose three electrodes end at "
+            "vertices. Largest difference from the disc that stereographic projection maps it to, in 90 % "
+            "of its radius.",
+            curved,
+        ),
+        *table(
             "Information against electrodes",
             f"Cramer-Rao bound of the root of var x + var y, % of the extent, noise of {100 * NOISE:g} % of "
             f"the total on every channel, {100 * INFORMATION_MARGIN:g} % of the extent left out at the "
@@ -355,7 +450,14 @@ def main() -> None:
     ]
     folder = output_folder(quick)
     (folder / "outlines.md").write_text("\n".join(page))
-    data = {"closed_forms": known, "accuracy": accuracy, "elements": mesh, "information": bound, "cost": cost}
+    data = {
+        "closed_forms": known,
+        "accuracy": accuracy,
+        "elements": mesh,
+        "surfaces": curved,
+        "information": bound,
+        "cost": cost,
+    }
     (folder / "outlines.json").write_text(json.dumps(data, indent=1) + "\n")
     draw(folder / "outlines.png", accuracy, bound)
 
