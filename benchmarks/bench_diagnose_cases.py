@@ -24,7 +24,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_cases import CASES, MENDED_S, SERIES_OHM, SETTLED_S, play_case
+from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, play_case
 from scores import Share, score_events
 
 from handtouch.wire.faults import FaultKind
@@ -44,15 +44,15 @@ def play_all(workers: int, journal: Path | None, share: float) -> list[Episode]:
     found: list[Episode] = [json.loads(line) for line in lines]
     done = {(it["case"], it["name"], it["number"]) for it in found}
     tasks = [
-        (rank / len(case.episodes), (index, *episode))
+        (not case.name.endswith("centre lines"), number // HAND_EPISODES, index, name, number)
         for index, case in enumerate(CASES)
-        for rank, episode in enumerate(case.episodes[: max(1, round(share * len(case.episodes)))])
-        if (case.name, *episode) not in done
+        for name, number in case.episodes[: max(1, round(share * len(case.episodes)))]
+        if (case.name, name, number) not in done
     ]
-    tasks = sorted(tasks)  # all cases side by side, so that a journal has a share of each
+    tasks = sorted(tasks)  # cases side by side, hand by hand, so that a journal has some of each
     with multiprocessing.get_context("fork").Pool(workers) as pool:
         for number, result in enumerate(
-            pool.imap_unordered(play_case, [task for _, task in tasks], chunksize=1), 1
+            pool.imap_unordered(play_case, [task[2:] for task in tasks], chunksize=1), 1
         ):
             found.append(result)
             if journal:

@@ -1,6 +1,6 @@
 """Cases for bench_diagnose_cases: pads, sheets and faults beyond the episodes of bench_diagnose.
 
-Public names: `Case`, `CASES`, `play_case`.
+Public names: `Case`, `CASES`, `HAND_EPISODES`, `play_case`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MENDED_S = 100.0
 SETTLED_S = 15.0
 """Time from when all faults are named, and the mended ones have ended, to the end of an episode."""
 SERIES_OHM = (100.0, 1000.0)
-_HAND_SEEDS = 4
+HAND_EPISODES = 4
 """Episodes that share a drawn hand."""
 _TABLES: dict[Any, Any] = {}
 PLAYED = tuple(name for name in FAULTY if name != "hysteresis tail")
@@ -166,7 +166,7 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
     """Play one episode of a case; return its events and all diagnoses, as lists that JSON has."""
     index, name, number = task
     case = CASES[index]
-    drawn, described, model = _hand(index, number // _HAND_SEEDS)
+    drawn, described, model = _hand(index, number // HAND_EPISODES)
     rng = np.random.default_rng((index, number, *name.encode()))
     (hand,) = described.hands
     sizes = {pad.link: _size_mm(pad) for pad in hand.pads}
