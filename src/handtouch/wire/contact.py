@@ -27,7 +27,7 @@ PERCEPT_KINDS = ("motion", "stiffness", "shape", "texture", "friction")
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""
-EXPERIMENTAL_PERCEPTS = frozenset({"stiffness", "texture", ACTION_REQUEST})
+EXPERIMENTAL_PERCEPTS = frozenset({"stiffness", "shape", "texture", ACTION_REQUEST})
 """Kinds of percepts of which too little is known in the world `default` to rely on them."""
 
 
