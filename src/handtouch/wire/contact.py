@@ -277,4 +277,4 @@ class Percept:
     expires_ns: int = 0
     """of an action request only: it is void from then on"""
     experimental: bool = False
-    """don't rely on it: such estimates are rare or unproven in the world `default`"""
+    """don't rely on it: such estimates are rare, unproven or sometimes wrong in the world `default`"""
