@@ -484,7 +484,7 @@ def force_tables(found: dict[tuple[str, str], Estimates]) -> tuple[Rows, Rows]:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--hours", type=float, default=24.0, help="of mixed use (default: 24)")
+    parser.add_argument("--hours", type=float, default=6.0, help="of mixed use (default: 6)")
     asked = parser.parse_args()
     quick = asked.quick
     hours, held_s, pads = (0.25, 120.0, 2) if quick else (asked.hours, 3600.0, PADS)

@@ -19,9 +19,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from bench_alarms import Hour
 from compressed_days import InlineSupervisor
 from page import made_by, options, output_folder, progress, table
+from soak_alarms import Hour
 
 from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.core.pad_model import PadModel

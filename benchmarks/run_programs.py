@@ -20,8 +20,8 @@ from page import OUT, keep_run_time, measured_commit
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
-    "alarms", "claims", "design", "diagnose", "electrodes", "gains", "grasp", "percept_grasp", "resolution",
-    "shear", "shear_slip", "sheet", "slip", "swap", "worlds",
+    "claims", "design", "diagnose", "diagnose_cases", "electrodes", "gains", "grasp", "percept_grasp",
+    "resolution", "shear", "shear_slip", "sheet", "slip", "supervise", "swap", "worlds",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside)."""
 
