@@ -108,8 +108,7 @@ def main() -> None:
         ),
         *table(
             "Number of electrodes",
-            "Anywhere on the boundary, 0.06 N, noise only, theory. A deployment has nodes of four channels "
-            "and electrodes on the sides, so it can't describe these.",
+            "Anywhere on the boundary, 0.06 N, noise only, theory.",
             counts,
         ),
     ]

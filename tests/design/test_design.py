@@ -28,8 +28,10 @@ from handtouch.design import (
     simulated_goal_map,
 )
 from handtouch.design.drawing import LayeredDrawing, write_dxf, write_svg
-from handtouch.hand import design, electrode_network
+from handtouch.hand import design, electrode_network, pad_network
 from handtouch.simulate.worlds import WORLDS
+from tests.deployments import CYLINDER, PLANE, pad_text
+from tests.deployments import deployment_text as deployment_of_pads
 
 FloatArray = NDArray[np.float64]
 CONFIG = Path(__file__).parents[2] / "config"
@@ -110,7 +112,7 @@ def test_impossible_requests_are_refused(task: PadTask, shorter: ElectrodeLayout
     with pytest.raises(ValueError, match="one electrode on each side"):
         optimise_layout(task, GOALS["linearity"], electrodes=6)
     anywhere = ElectrodeLayout(shorter.stretches_m + 4e-3, shorter.series_ohm)
-    with pytest.raises(ValueError, match="four channels"):
+    with pytest.raises(ValueError, match="cylinder or plane; this pad's is sphere"):
         pad_with_layout(task, anywhere)
 
 
@@ -171,6 +173,66 @@ def test_the_deployment_of_a_design_loads_and_keeps_the_rest(
     assert pads[TIP].series_ohm == (10.0, 82.0, 0.0, 0.0)
     assert {**pads, TIP: task.pad} == {entry.pad.link: entry.pad for entry in old.pads}
     assert "# A Utah/MIT hand" in (tmp_path / "new.toml").read_text()
+
+
+def flat_file(folder: Path, surface: str, channels: str = "") -> Path:
+    """A deployment of two pads, the first with this surface."""
+    text = deployment_of_pads(
+        pad_text("tip", 1, surface, "serial = 1"), pad_text("other", 2, extra="serial = 2")
+    )
+    path = folder / "flat.toml"
+    path.write_text(text.replace("drive_v = 5.0", f"{channels}\ndrive_v = 5.0"))
+    return path
+
+
+@pytest.mark.parametrize("surface", [PLANE, CYLINDER], ids=["plane", "cylinder"])
+@pytest.mark.parametrize("count", [3, 6, 8])
+def test_electrodes_anywhere_become_arcs_of_an_outline_in_the_deployment(
+    surface: str, count: int, tmp_path: Path
+) -> None:
+    path = flat_file(tmp_path, surface, 'channels = ["0x2001:3:i16", "0x2001:4:i16", "0x2001:5", "0x2001:6"]')
+    path.write_text(path.read_text().replace('"0x2001:5", "0x2001:6"', '"0x2001:5:i16", "0x2001:6:i16"'))
+    old = config.load(path)
+    task = PadTask.from_deployment(old, "tip", 1.0).with_points(5)
+    whole = task.boundary.perimeter_m
+    begin = 7e-3 + whole * np.arange(count) / count
+    layout = ElectrodeLayout(
+        np.column_stack([begin, begin + 0.7 * whole / count]), np.resize([0.0, 82.0, 10.0], count)
+    )
+    (tmp_path / "new.toml").write_text(deployment_text(path, task, layout, tmp_path))
+    new = config.load(tmp_path / "new.toml")
+    pads = {entry.pad.link: entry.pad for entry in new.pads}
+    x, y = task.grid
+    network = pad_network(pads["tip"], task.sheet)
+    place = task.surface.point(x, y)
+    on_outline = pads["tip"].surface.build()
+    scaled = (x * on_outline.a / task.surface.a, y * on_outline.b / task.surface.b)
+    np.testing.assert_allclose(on_outline.point(*scaled), place, atol=2e-7)
+    expected = layout.network(task.boundary, task.sheet.ohm_per_square).fractions(x, y)
+    np.testing.assert_allclose(network.fractions(*scaled), expected, atol=2e-5)
+    channels = new.nodes[pads["tip"].node].channels
+    assert channels == tuple(f"0x2001:{3 + k}:i16" for k in range(count))
+    assert (pads["other"], new.nodes["n"]) == (old.pads[1].pad, old.nodes["n"])
+
+
+def test_channels_that_do_not_follow_each_other_are_not_continued(tmp_path: Path) -> None:
+    path = flat_file(tmp_path, PLANE, 'channels = ["0x6401:4", "0x6401:1", "0x6401:2", "0x6401:3"]')
+    task = PadTask.from_deployment(config.load(path), "tip", 1.0)
+    begin = task.boundary.perimeter_m * np.arange(6) / 6
+    layout = ElectrodeLayout(np.column_stack([begin, begin + 8e-3]), np.zeros(6))
+    with pytest.raises(ValueError, match=r"0x6401:4, .* write a \[node\] table with as many channels"):
+        deployment_text(path, task, layout, tmp_path)
+
+
+def test_design_command_writes_tables_of_six_electrodes_that_the_daemon_accepts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["design", str(flat_file(tmp_path, PLANE)), "--link", "tip", "--goal", "position"]
+    assert main([*command, "--electrodes", "6", "--world", "ideal", "--json", "-o", str(tmp_path)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["no_tables"], len(report["electrodes"])) == ("", 6)
+    assert report["after"] < report["before"]
+    assert main(["check", str(tmp_path / "tip_position.toml")]) == 0
 
 
 def test_design_command_writes_drawings_and_tables(

@@ -50,7 +50,7 @@ def run(
         with ProgressLine() as progress:
             result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
             simulated = _simulated(task, result, world, progress) if check else None
-            files = _write(config_path, task, result, world, out, progress)
+            files, no_tables = _write(config_path, task, result, world, out, progress)
     except (config.ConfigError, ValueError, ImportError) as error:
         print(f"handtouch design: {error}", file=sys.stderr)
         return 2
@@ -58,9 +58,9 @@ def run(
         print(f"handtouch design: {error}", file=sys.stderr)
         return 1
     if as_json:
-        print_json(_as_json(task, result, simulated, files))
+        print_json(_as_json(task, result, simulated, files) | {"no_tables": no_tables})
     else:
-        _print(task, result, world, simulated, files)
+        _print(task, result, world, simulated, files, no_tables)
     return 0
 
 
@@ -89,8 +89,11 @@ def _simulated(
 
 def _write(
     config_path: Path, task: PadTask, result: DesignResult, world: str, out: Path, progress: ProgressLine
-) -> list[Path]:
-    """Write pictures, drawings and, where possible, the deployment; return their paths."""
+) -> tuple[list[Path], str]:
+    """Write pictures, drawings and, where possible, the deployment.
+
+    Return their paths, and why there is no deployment.
+    """
     from handtouch.design import deployment_text, fabrication_drawing
     from handtouch.design.drawing import write_dxf, write_svg
     from handtouch.design.pictures import draw_before_and_after
@@ -102,12 +105,15 @@ def _write(
     files = draw_before_and_after(task, result, title, out / f"{stem}_map")
     drawing = fabrication_drawing(task, result.after)
     texts = {f"{stem}.svg": write_svg(drawing), f"{stem}.dxf": write_dxf(drawing)}
-    if result.after.is_on_sides(task.boundary):
+    no_tables = ""
+    try:
         texts[f"{stem}.toml"] = deployment_text(config_path, task, result.after, out)
+    except ValueError as error:
+        no_tables = str(error)
     for name, text in texts.items():
         (out / name).write_text(text, encoding="utf-8")
         files.append(out / name)
-    return files
+    return files, no_tables
 
 
 def _rows(task: PadTask, layout: ElectrodeLayout) -> list[dict[str, Any]]:
@@ -154,6 +160,7 @@ def _print(
     world: str,
     simulated: tuple[float, float] | None,
     files: list[Path],
+    no_tables: str,
 ) -> None:
     goal, unit = result.goal, result.goal.unit
     ratio = result.value_before / result.value_after
@@ -169,10 +176,10 @@ def _print(
             f"  {row['electrode']:<10}{row['start_mm']:>9.2f}{row['stop_mm']:>9.2f}"
             f"{row['bare_after_mm']:>11.2f}{row['series_ohm']:>13g}"
         )
+    if no_tables:
+        print(f"  no tables: {no_tables}")
     if not result.after.is_on_sides(task.boundary):
-        print(
-            "  no tables: a deployment describes four electrodes, one on each side; neither was it simulated"
-        )
-    elif ratio == 1:
+        print("  not simulated: electrodes aren't one on each side")
+    if ratio == 1:
         print("  nothing better was found within these limits")
     print(*files, sep="\n")
