@@ -38,8 +38,8 @@ from tests.client.hand_messages import make_contact, make_frame
 
 PACKAGE = Path(__file__).parents[2] / "clients" / "ros2" / "handtouch_msgs"
 WALL_OFFSET_NS = 1_700_000_000_000_000_123
-NOT_ON_ROS = {"v", "session", "seq", "t_ns", "retained", "frame", "begin_ns"}
-"""Fields of `contact` that are in the headers, in `begin`, or about the transport"""
+NOT_ON_ROS = {"v", "session", "seq", "t_ns", "retained", "frame", "begin_ns", "parts"}
+"""Fields of `contact` that are in the headers, in `begin`, or about the transport; two contacts of one pad"""
 
 
 def typestore(release: Stores) -> Any:
