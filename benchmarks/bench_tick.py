@@ -25,6 +25,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
+from tests.core.shear_bench import PATTERNS, ShearBench
 
 PADS = (15, 60, 240, 960)
 PARTS = (0.1, 1.0)
@@ -33,6 +34,8 @@ SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
 SPEEDS = {"static": 0.0, "sliding": SLIDING_M}
 CURRENT_RATIO = 20.0  # of the threshold's current
 PAUSE_S = 0.003
+SHEAR_PADS = 15
+SHEAR_M, SHEAR_FORCES_N = 1e-4, (1.0, 2.0)  # of displacements and of normal forces, by turns
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
@@ -121,6 +124,27 @@ def measure(ticks: int) -> list[Row]:
     return rows
 
 
+def measure_shear(ticks: int) -> list[Row]:
+    """Return rows with the microseconds of the force vectors of touched pads above shear pads."""
+    rows = []
+    for kind in PATTERNS:
+        row: Row = {"pattern": kind}
+        for state, pause_s in (("hot", 0.0), ("cold", PAUSE_S)):
+            pads, spent = ShearBench([kind] * SHEAR_PADS), []
+            samples = [(n, pads.counts(0, (SHEAR_M * n, -SHEAR_M), n)) for n in SHEAR_FORCES_N]
+            for number in range(ticks + 10):
+                normal_n, counts = samples[number % 2]
+                for pad in range(SHEAR_PADS):
+                    pads.touch(pad, normal_n, (1e-3, 0.0), counts)
+                if pause_s:
+                    time.sleep(pause_s)
+                spent.append(pads.tick())
+            row[state] = float(np.median(spent[10:])) * 1e-3
+        rows.append(row | {"hot, per contact": row["hot"] / SHEAR_PADS})
+        print(rows[-1], flush=True)
+    return rows
+
+
 def pick(rows: list[Row], state: str, pads: int, touched: int, contacts: str) -> Row:
     key = (state, pads, touched, contacts)
     return next(r for r in rows if (r["state"], r["pads"], r["touched"], r["contacts"]) == key)
@@ -141,13 +165,17 @@ def whole(row: Row) -> float:
     return float(row["tick"] + row["prepare"])
 
 
-def write(rows: list[Row], machine: str, out: Path) -> str:
+def write(rows: list[Row], shear: list[Row], machine: str, out: Path) -> str:
     table = "\n".join(line(rows, row) for row in rows if row["state"] == "hot")
     idle = "\n".join(
         f"* {pads} pads: {whole(none) / whole(pick(rows, 'hot', pads, pads, 'static')):.0%} of all static, "
         f"{whole(none) / whole(pick(rows, 'hot', pads, pads, 'sliding')):.0%} of all sliding"
         for pads in PADS
         for none in [pick(rows, "hot", pads, 0, "none")]
+    )
+    vectors = "\n".join(
+        f"| {row['pattern']} | {row['hot']:.1f} | {row['hot, per contact']:.2f} | {row['cold']:.1f} |"
+        for row in shear
     )
     few, many = PADS[0], PADS[-1]
     growth = {kind: whole(pick(rows, "hot", many, many, kind)) for kind in SPEEDS}
@@ -171,10 +199,20 @@ Cost of untouched pads as a fraction of that of touched ones:
 Growth from {few} to {many} pads, {many // few} times as many, all touched: {growth["static"]:.1f}
 times static, {growth["sliding"]:.1f} times sliding.
 
+## Shear pads
+
+What the force vectors of {SHEAR_PADS} touched pads above shear pads add to a tick, by pattern of electrodes.
+
+| pattern | hot | hot, per contact | cold |
+| --- | --- | --- | --- |
+{vectors}
+
 {made_by()}.
 """
     (out / "tick.md").write_text(text)
-    (out / "tick.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
+    (out / "tick.json").write_text(
+        json.dumps({"machine": machine, "rows": rows, "shear": shear}, indent=1) + "\n"
+    )
     return text
 
 
@@ -183,7 +221,8 @@ def main() -> None:
     parser.add_argument("--ticks", type=int, default=200)
     asked = parser.parse_args()
     machine = f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    print(write(measure(5 if asked.quick else asked.ticks), machine, output_folder(asked.quick)))
+    ticks = 5 if asked.quick else asked.ticks
+    print(write(measure(ticks), measure_shear(ticks), machine, output_folder(asked.quick)))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -121,10 +122,13 @@ class ShearBench:
         for pdo in range(2):
             self.slab.write_pdo(pad, words[8 * pdo : 8 * pdo + 8], 1, pdo)
 
-    def tick(self) -> None:
-        """Run the stage on the present samples of all pads."""
+    def tick(self) -> int:
+        """Run the stage on the present samples of all pads; return how long it took [ns]."""
         self.state.ticks[0] += 1
         self.state.sample_ns[:] += 10_000_000
         self.slab.unpack_counts()
+        begin_ns = time.perf_counter_ns()
         self.forces.update_forces(self.slab)
+        spent_ns = time.perf_counter_ns() - begin_ns
         self.slab.begin_cycle(2)
+        return spent_ns
