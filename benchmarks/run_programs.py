@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
     "claims", "design", "diagnose", "diagnose_cases", "electrodes", "gains", "grasp", "percept_grasp",
-    "resolution", "shear", "shear_slip", "sheet", "slip", "supervise", "swap", "worlds",
+    "resolution", "shear", "shear_slip", "sheet", "supervise", "swap", "worlds",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside)."""
 
