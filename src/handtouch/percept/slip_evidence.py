@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.slip import SlipDetector
+from handtouch.percept.relative_motion import LinkPoses
 from handtouch.percept.samples import ContactBuffer, IntArray
 
 FloatArray = NDArray[np.float64]
@@ -84,11 +85,15 @@ def slip_features(buffer: ContactBuffer, slip: SlipDetector, pads: IntArray, per
         ]
     holding = (slipping == 0) & (log_ratio < _MAX_HOLDING_LOG_RATIO)
     turned, link_moved, relative, relative_std = [], [], [], []
+    now, normal = LinkPoses.from_buffer(buffer, pads), buffer.latest_field(pads, "palm_normal")
     for window_s in _LINK_WINDOWS_S:
-        ways = _LinkWays.from_buffer(buffer, pads, max(round(window_s / period_s), 1))
-        turned.append(ways.turned_rad)
-        link_moved.append(1e3 * np.linalg.norm(_tangential(ways.moved_m, ways.normal), axis=1))
-        against_m, std_m = _relative_to_rigid(ways, holding, buffer.hand_index[pads], window_s)
+        before = LinkPoses.from_buffer(buffer, pads, max(round(window_s / period_s), 1))
+        way = now.material_way_m(before)
+        turned.append(_turned_rad(now, before))
+        link_moved.append(1e3 * np.linalg.norm(_tangential(way, normal), axis=1))
+        against_m, std_m = _relative_to_rigid(
+            now.palm_m, normal, way, holding, buffer.hand_index[pads], window_s
+        )
         relative.append(1e3 * against_m)
         relative_std.append(1e3 * std_m)
     of_hand = [
@@ -97,35 +102,14 @@ def slip_features(buffer: ContactBuffer, slip: SlipDetector, pads: IntArray, per
     return np.stack([*columns, *turned, *link_moved, *relative, *relative_std, *of_hand], axis=1)
 
 
-@dataclass(frozen=True, slots=True)
-class _LinkWays:
-    """Ways of links under contacts, in the palm frame: rotation (k,), positions, normals and ways (k, 3)."""
-
-    position_m: FloatArray
-    normal: FloatArray
-    turned_rad: FloatArray
-    moved_m: FloatArray
-
-    @classmethod
-    def from_buffer(cls, buffer: ContactBuffer, pads: IntArray, back: int) -> _LinkWays:
-        """Return the ways over the last `back` samples; NaN where unknown."""
-        position, on_link, rotation = (
-            buffer.latest_field(pads, name) for name in ("palm_position_m", "position_m", "palm_rotation")
-        )
-        was, was_on_link, was_rotation = (
-            buffer.latest_field(pads, name, back)
-            for name in ("palm_position_m", "position_m", "palm_rotation")
-        )
-        # way of the point of the link that is now in contact
-        moved = position - was - (was_rotation @ (on_link - was_on_link)[:, :, None])[:, :, 0]
-        turn = rotation @ was_rotation.transpose(0, 2, 1)
-        axis = np.stack(
-            [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]],
-            axis=1,
-        )
-        return cls(
-            position, buffer.latest_field(pads, "palm_normal"), np.linalg.norm(axis, axis=1) / 2, moved
-        )
+def _turned_rad(now: LinkPoses, before: LinkPoses) -> FloatArray:
+    """Return the angles (k,) by which links have turned, as their sines."""
+    turn = now.rotation @ before.rotation.transpose(0, 2, 1)
+    axis = np.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]],
+        axis=1,
+    )
+    return np.asarray(np.linalg.norm(axis, axis=1) / 2)
 
 
 def _tangential(way: FloatArray, normal: FloatArray) -> FloatArray:
@@ -133,7 +117,12 @@ def _tangential(way: FloatArray, normal: FloatArray) -> FloatArray:
 
 
 def _relative_to_rigid(
-    ways: _LinkWays, holding: NDArray[np.bool_], hand: IntArray, window_s: float
+    position_m: FloatArray,
+    normals: FloatArray,
+    moved_m: FloatArray,
+    holding: NDArray[np.bool_],
+    hand: IntArray,
+    window_s: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Return each contact's way (k,) [m] relative to a rigid body on its hand's other holding contacts.
 
@@ -141,12 +130,12 @@ def _relative_to_rigid(
     """
     n = len(holding)
     against, std = np.full(n, np.nan), np.full(n, np.nan)
-    known = np.isfinite(ways.moved_m).all(axis=1)
+    known = np.isfinite(moved_m).all(axis=1)
     for number in np.unique(hand[known]):
         rows = np.flatnonzero(known & (hand == number))
         holds = holding[rows].astype(np.float64)
         others = holds.sum() - holds
-        position, normal, way = ways.position_m[rows], ways.normal[rows], ways.moved_m[rows]
+        position, normal, way = position_m[rows], normals[rows], moved_m[rows]
         x, y, z = (position - position.mean(axis=0)).T
         at = np.zeros((len(rows), 3, 6))  # way at a point: v + omega x offset
         at[:, [0, 1, 2], [0, 1, 2]] = 1.0
