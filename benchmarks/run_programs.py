@@ -27,7 +27,7 @@ SIDE_BY_SIDE = (
 
 
 class Runner:
-    """Runs programs and tells how each went.
+    """Runs programs and reports how each went.
 
     `output` is the folder for what they print, `options` go to each of them.
     """
@@ -51,7 +51,7 @@ class Runner:
 
     def _run(self, program: Path) -> None:
         path = self.output / f"{program.stem}.txt"
-        self._tell(f"{program.stem}: begins")
+        self._report(f"{program.stem}: begins")
         began_s = time.monotonic()
         with path.open("w") as file:
             done = subprocess.run(
@@ -61,11 +61,11 @@ class Runner:
         if done.returncode:
             self.failed.append(program)
             last = "\n    ".join(path.read_text(errors="replace").splitlines()[-12:])
-            self._tell(f"{program.stem}: FAILED after {took}, exit code {done.returncode}\n    {last}")
+            self._report(f"{program.stem}: FAILED after {took}, exit code {done.returncode}\n    {last}")
         else:
-            self._tell(f"{program.stem}: done in {took}")
+            self._report(f"{program.stem}: done in {took}")
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         print(f"[{self.minutes:5.1f} min] {text}", flush=True)
 
 

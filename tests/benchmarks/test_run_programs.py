@@ -37,18 +37,18 @@ def test_a_failed_program_is_named_with_its_last_lines_and_stops_no_other(
     good.write_text("import sys\nprint('measured', *sys.argv[1:])\n")
     runner = Runner(tmp_path / "out", ["--quick"])
     runner.run([bad, good], 1)
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert runner.failed == [bad]
-    assert re.search(r"bench_bad: FAILED after .*, exit code 1\n    first\n    no such pad", told)
-    assert "bench_good: done in" in told
+    assert re.search(r"bench_bad: FAILED after .*, exit code 1\n    first\n    no such pad", printed)
+    assert "bench_good: done in" in printed
     assert (tmp_path / "out" / "bench_good.txt").read_text() == "measured --quick\n"
 
 
 def test_an_unknown_program_is_refused_with_the_names_of_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "worms"]) == 2
-    told = capsys.readouterr().err
-    assert "bench_worms.py" in told
-    assert "worlds" in told
+    printed = capsys.readouterr().err
+    assert "bench_worms.py" in printed
+    assert "worlds" in printed
 
 
 def test_one_named_program_writes_to_the_terminal_and_its_exit_code_is_returned() -> None:
