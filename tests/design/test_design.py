@@ -224,6 +224,15 @@ def test_channels_that_do_not_follow_each_other_are_not_continued(tmp_path: Path
         deployment_text(path, task, layout, tmp_path)
 
 
+def test_electrodes_anywhere_above_a_shear_pad_are_not_written() -> None:
+    deployment = config.load(CONFIG / "shear.toml")
+    task = PadTask.from_deployment(deployment, deployment.pads[0].pad.link, 1.0)
+    begin = task.boundary.perimeter_m * np.arange(6) / 6
+    layout = ElectrodeLayout(np.column_stack([begin, begin + 7e-3]), np.zeros(6))
+    with pytest.raises(ValueError, match="can't lie above a shear pad"):
+        pad_with_layout(task, layout)
+
+
 def test_design_command_writes_tables_of_six_electrodes_that_the_daemon_accepts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

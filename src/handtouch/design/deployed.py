@@ -54,6 +54,10 @@ def pad_with_layout(task: PadTask, layout: ElectrodeLayout) -> config.Pad:
 
 
 def _pad_with_arcs(task: PadTask, layout: ElectrodeLayout) -> config.Pad:
+    if task.pad.shear is not None:
+        raise ValueError(
+            f'an outline can\'t lie above a shear pad, and this pad has shear = "{task.pad.shear}"'
+        )
     surface, first_mm = _outline_of(task)
     whole_mm = 1e3 * task.boundary.perimeter_m
     arcs = {}
