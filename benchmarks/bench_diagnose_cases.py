@@ -24,7 +24,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, play_case
+from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, matches, play_case
 from scores import Share, score_events
 
 from handtouch.wire.faults import FaultKind
@@ -70,10 +70,7 @@ def of_case(episodes: Sequence[Episode], case: str) -> list[Episode]:
 
 def is_right(episode: Episode, one: dict[str, Any]) -> bool:
     """Return whether a diagnosis names a fault that was played, on its pad, after it began."""
-    return any(
-        (event["kind"], event["link"]) == (one["kind"], one["link"]) and one["at_s"] >= event["begin_s"]
-        for event in episode["events"]
-    )
+    return any(matches(event, one) for event in episode["events"])
 
 
 def row(episodes: Sequence[Episode], **names: str) -> dict[str, Any]:

@@ -1,28 +1,27 @@
 """Cases for bench_diagnose_cases: pads, sheets and faults beyond the episodes of bench_diagnose.
 
-Public names: `Case`, `CASES`, `HAND_EPISODES`, `play_case`.
+Public names: `Case`, `CASES`, `HAND_EPISODES`, `play_case`, `matches`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from diagnose_episodes import BLOCK, ELECTRODES, FAULTY, PADS, RATE_HZ, Play, deployment, draw_fault
+from diagnose_episodes import ELECTRODES, FAULTY, PADS, Play, deployment, draw_fault, sample_blocks, size_mm
 from pydantic import TypeAdapter
 
 from handtouch import config
 from handtouch.config.surfaces import PadSurface
-from handtouch.hand import pad_surface
 from handtouch.simulate.faults import FAULTS, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, Family, World, world_with
-from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples
+from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics
 from handtouch.wire.faults import FaultKind
 
 MENDED_S = 100.0
@@ -32,6 +31,8 @@ SETTLED_S = 15.0
 SERIES_OHM = (100.0, 1000.0)
 HAND_EPISODES = 4
 """Episodes that share a drawn hand."""
+BLOCKS_AT_ONCE = 20
+"""Blocks of samples that are computed together: an episode may end early."""
 _TABLES: dict[Any, Any] = {}
 PLAYED = tuple(name for name in FAULTY if name != "hysteresis tail")
 """Faults that are drawn; a tail is a use of a healthy pad."""
@@ -169,7 +170,7 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
     drawn, described, model = _hand(index, number // HAND_EPISODES)
     rng = np.random.default_rng((index, number, *name.encode()))
     (hand,) = described.hands
-    sizes = {pad.link: _size_mm(pad) for pad in hand.pads}
+    sizes = {pad.link: size_mm(pad) for pad in hand.pads}
     keys = _draw_faults(case, name, rng, sizes)
     if name == "centre lines":
         touches = _touch_centre_lines(rng, case.length_s)
@@ -187,7 +188,7 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
     diagnosis = HandDiagnostics(model, tables=_TABLES)
     found: list[dict[str, Any]] = []
     t_s, quiet_since_s = 0.0, None
-    for block in _blocks(virtual, case.length_s):
+    for block in sample_blocks(virtual, case.length_s, BLOCKS_AT_ONCE):
         t_s = float(block.sample_ns.max()) * 1e-9
         for it in diagnosis.process_block(block):
             if not it.is_fault:
@@ -210,8 +211,8 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
             )  # fmt: skip
         if not events or case.name == "loose electrode":
             continue
-        named = all(any(_matches(event, one) for one in found) for event in events)
-        wrong = [one for one in found if not any(_matches(event, one) for event in events)]
+        named = all(any(matches(event, one) for one in found) for event in events)
+        wrong = [one for one in found if not any(matches(event, one) for event in events)]
         wrong = [one for one in wrong if one["kind"] != FaultKind.UNEXPLAINED]
         lasting = [one for one in found if one["until_s"] is None]
         mended_s = events[0]["begin_s"] + MENDED_S
@@ -225,25 +226,8 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _matches(event: dict[str, Any], one: dict[str, Any]) -> bool:
+def matches(event: dict[str, Any], one: dict[str, Any]) -> bool:
     """Return whether a diagnosis names an event on its pad, after it began."""
     return bool(
         one["kind"] == event["kind"] and one["link"] == event["link"] and one["at_s"] >= event["begin_s"]
     )
-
-
-def _blocks(virtual: VirtualHand, length_s: float) -> Iterator[HandSamples]:
-    """Yield the samples of a hand in blocks, computed some seconds at a time."""
-    some = 20 * BLOCK
-    for start in range(0, int(length_s * RATE_HZ), some):
-        times = (start + np.arange(some)) / RATE_HZ
-        counts = np.stack([virtual.counts(row, times) for row in range(len(PADS))], axis=1)
-        stamps = np.repeat(np.rint(times * 1e9).astype(np.int64)[:, None], len(PADS), axis=1)
-        for first in range(0, some, BLOCK):
-            part = slice(first, first + BLOCK)
-            yield HandSamples(stamps[part], counts[part], np.ones((BLOCK, len(PADS)), np.bool_))
-
-
-def _size_mm(pad: config.Pad) -> tuple[float, float]:
-    u, v = pad_surface(pad).extent_m
-    return 1e3 * u, 1e3 * v

@@ -11,6 +11,7 @@ import numpy as np
 
 from handtouch import config
 from handtouch.config import shipped
+from handtouch.hand import pad_surface
 from handtouch.simulate.faults import FAULTS, INFLUENCES, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -58,12 +59,21 @@ class Episode:
 
     def blocks(self, length_s: float = LENGTH_S) -> Iterator[HandSamples]:
         """Yield its samples in blocks."""
-        ticks = int(length_s * RATE_HZ) // BLOCK * BLOCK
-        times = np.arange(ticks) / RATE_HZ
-        counts = np.stack([self.hand.counts(row, times) for row in range(len(PADS))], axis=1)
+        return sample_blocks(self.hand, length_s)
+
+
+def sample_blocks(
+    hand: VirtualHand, length_s: float, blocks_at_once: int | None = None
+) -> Iterator[HandSamples]:
+    """Yield the samples of a hand in blocks; blocks_at_once: computed in one call, by default all."""
+    ticks = int(length_s * RATE_HZ) // BLOCK * BLOCK
+    fresh = np.ones((BLOCK, len(PADS)), dtype=np.bool_)
+    some = ticks if blocks_at_once is None else blocks_at_once * BLOCK
+    for start in range(0, ticks, some):
+        times = np.arange(start, min(start + some, ticks)) / RATE_HZ
+        counts = np.stack([hand.counts(row, times) for row in range(len(PADS))], axis=1)
         stamps = np.repeat(np.rint(times * 1e9).astype(np.int64)[:, None], len(PADS), axis=1)
-        fresh = np.ones((BLOCK, len(PADS)), dtype=np.bool_)
-        for first in range(0, ticks, BLOCK):
+        for first in range(0, len(times), BLOCK):
             part = slice(first, first + BLOCK)
             yield HandSamples(stamps[part], counts[part], fresh)
 
@@ -238,9 +248,12 @@ class Play:
 
 @lru_cache(maxsize=8)
 def _size_mm(link: str) -> tuple[float, float]:
-    from handtouch.hand import pad_surface
-
     (pad,) = (pad for pad in deployment().hands[0].pads if pad.link == link)
+    return size_mm(pad)
+
+
+def size_mm(pad: config.Pad) -> tuple[float, float]:
+    """Return the extents of a pad's surface [mm]."""
     u, v = pad_surface(pad).extent_m
     return 1e3 * u, 1e3 * v
 
