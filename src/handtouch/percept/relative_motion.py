@@ -1,6 +1,6 @@
 """Velocity of a link's surface relative to the object it touches, from joint states and other contacts.
 
-Public names: `LinkPoses`, `LinkMotions`, `relative_to_object`, `RelativeMotion`, `VELOCITY_WINDOW_S`.
+Public names: `ContactLinkPoses`, `LinkMotions`, `relative_to_object`, `RelativeMotion`, `VELOCITY_WINDOW_S`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class RelativeMotion:
         }
 
 
-class LinkPoses(NamedTuple):
+class ContactLinkPoses(NamedTuple):
     """Poses of the links under contacts at one sample, NaN where unknown.
 
     Positions of the contacts in the palm frame and in the links' frames (k, 3), and the links' rotations in
@@ -62,12 +62,12 @@ class LinkPoses(NamedTuple):
     rotation: FloatArray
 
     @classmethod
-    def from_buffer(cls, buffer: ContactBuffer, pads: IntArray, back: IntArray | int = 0) -> LinkPoses:
+    def from_buffer(cls, buffer: ContactBuffer, pads: IntArray, back: IntArray | int = 0) -> ContactLinkPoses:
         """Return those of the last sample of pads (k,), or of `back` samples earlier."""
         names = ("palm_position_m", "position_m", "palm_rotation")
         return cls(*(buffer.latest_field(pads, name, back) for name in names))
 
-    def material_way_m(self, before: LinkPoses) -> FloatArray:
+    def material_way_m(self, before: ContactLinkPoses) -> FloatArray:
         """Return the ways (k, 3) in the palm frame, since then, of the links' points now in contact."""
         on_link = (before.rotation @ (self.link_m - before.link_m)[:, :, None])[:, :, 0]
         return np.asarray(self.palm_m - before.palm_m - on_link)
@@ -96,8 +96,8 @@ class LinkMotions(NamedTuple):
             return cls(pads, none, none, none, np.zeros(0))
         back = np.minimum(max(round(VELOCITY_WINDOW_S / period_s), 1), buffer.sample_count[pads] - 1)
         last_ns, then_ns = buffer.latest_sample_ns(pads), buffer.latest_sample_ns(pads, back)
-        now, normal = LinkPoses.from_buffer(buffer, pads), buffer.latest_field(pads, "palm_normal")
-        moved = now.material_way_m(LinkPoses.from_buffer(buffer, pads, back))
+        now, normal = ContactLinkPoses.from_buffer(buffer, pads), buffer.latest_field(pads, "palm_normal")
+        moved = now.material_way_m(ContactLinkPoses.from_buffer(buffer, pads, back))
         known = (
             np.isfinite(moved).all(axis=1)
             & (now_ns - last_ns <= VELOCITY_WINDOW_S * 1e9)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.slip import SlipDetector
-from handtouch.percept.relative_motion import LinkPoses
+from handtouch.percept.relative_motion import ContactLinkPoses
 from handtouch.percept.samples import ContactBuffer, IntArray
 
 FloatArray = NDArray[np.float64]
@@ -85,9 +85,9 @@ def slip_features(buffer: ContactBuffer, slip: SlipDetector, pads: IntArray, per
         ]
     holding = (slipping == 0) & (log_ratio < _MAX_HOLDING_LOG_RATIO)
     turned, link_moved, relative, relative_std = [], [], [], []
-    now, normal = LinkPoses.from_buffer(buffer, pads), buffer.latest_field(pads, "palm_normal")
+    now, normal = ContactLinkPoses.from_buffer(buffer, pads), buffer.latest_field(pads, "palm_normal")
     for window_s in _LINK_WINDOWS_S:
-        before = LinkPoses.from_buffer(buffer, pads, max(round(window_s / period_s), 1))
+        before = ContactLinkPoses.from_buffer(buffer, pads, max(round(window_s / period_s), 1))
         way = now.material_way_m(before)
         turned.append(_turned_rad(now, before))
         link_moved.append(1e3 * np.linalg.norm(_tangential(way, normal), axis=1))
@@ -102,7 +102,7 @@ def slip_features(buffer: ContactBuffer, slip: SlipDetector, pads: IntArray, per
     return np.stack([*columns, *turned, *link_moved, *relative, *relative_std, *of_hand], axis=1)
 
 
-def _turned_rad(now: LinkPoses, before: LinkPoses) -> FloatArray:
+def _turned_rad(now: ContactLinkPoses, before: ContactLinkPoses) -> FloatArray:
     """Return the angles (k,) by which links have turned, as their sines."""
     turn = now.rotation @ before.rotation.transpose(0, 2, 1)
     axis = np.stack(
