@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 
@@ -55,10 +56,23 @@ class PlayLoops:
 
     def swing_n(self, high_n: float, low_n: float) -> float:
         """Return the change of the reading [N] between two turning points."""
-        swing, shares = high_n - low_n, [(k + 1) / (self.plays + 1) for k in range(self.plays)]
-        weight = self.width / sum(min(share, 1 - share) for share in shares)
-        linear = (1 - weight * self.plays / 2) * swing
-        return linear + weight * sum(max(swing - share * self.full_n, 0.0) for share in shares)
+        swing, weight, total = high_n - low_n, self._weight, 0.0
+        for threshold in self._thresholds_n:
+            if swing > threshold:
+                total += swing - threshold
+        return (1 - weight * self.plays / 2) * swing + weight * total
+
+    @cached_property
+    def _shares(self) -> list[float]:
+        return [(k + 1) / (self.plays + 1) for k in range(self.plays)]
+
+    @cached_property
+    def _thresholds_n(self) -> list[float]:
+        return [share * self.full_n for share in self._shares]
+
+    @cached_property
+    def _weight(self) -> float:
+        return self.width / sum(min(share, 1 - share) for share in self._shares)
 
 
 @dataclass

@@ -170,16 +170,19 @@ def advance(
 
 def _adapt(law: BackForces, state: SheetState, dt_s: float, load_n: float, is_excited: bool) -> float:
     """Return the effective load [N] at the end of the interval."""
-    flows = is_excited and load_n - float(state.back_n.sum()) > law.threshold_n
+    back_n = sum(state.back_n.tolist())
+    flows = is_excited and load_n - back_n > law.threshold_n
     shares, times = law.elements
     if flows:
         speed = 1 + (state.flow_s + dt_s / 2) / law.fatigue_s  # integrated over dt
         state.back_n += (shares * load_n - state.back_n) * -np.expm1(-dt_s * speed / times)
         state.flow_s += dt_s
+        back_n = sum(state.back_n.tolist())
     if not is_excited:
         state.back_n *= math.exp(-dt_s / law.recovery_s)
+        back_n = sum(state.back_n.tolist())
     is_pressed = load_n > law.threshold_n
-    if not is_pressed and 0 < state.peak_n < law.wipe_fraction * float(state.back_n.sum()):
+    if not is_pressed and 0 < state.peak_n < law.wipe_fraction * back_n:
         state.back_n[:] = 0.0
     state.peak_n = max(state.peak_n, load_n) if is_pressed else 0.0
-    return load_n - float(state.back_n.sum()) if flows else 0.0
+    return load_n - back_n if flows else 0.0

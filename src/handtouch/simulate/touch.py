@@ -142,6 +142,9 @@ class ScheduledTouches:
             if lane is None:
                 self._lanes.append(lane := [])
             lane.append((touch, patch))
+        self._spans_s = [
+            np.array([(touch.from_s, touch.until_s) for touch, _ in lane]).T for lane in self._lanes
+        ]
 
     @property
     def max_contacts(self) -> int:
@@ -166,16 +169,16 @@ class ScheduledTouches:
         k, n = len(self._lanes), len(times_s)
         position, force = np.full((k, 2, n), 0.5), np.zeros((k, n))
         patches = np.tile([[1.0], [0.0], [0.0]], (k, 1, n))
-        for row, lane in enumerate(self._lanes):
-            for touch, patch in lane:
-                first, last = np.searchsorted(ordered, (touch.from_s, touch.until_s))
-                if first < last:
-                    during = order[first:last]
-                    position[row][:, during] = touch.positions(times_s[during])
-                    force[row, during] = touch.forces(times_s[during])
-                    patches[row][:, during] = np.outer(
-                        [patch.radius_m, *patch.focus_m], patch.growth(force[row, during])
-                    )
+        for row, (lane, spans_s) in enumerate(zip(self._lanes, self._spans_s, strict=True)):
+            first, last = np.searchsorted(ordered, spans_s)
+            for number in np.flatnonzero(first < last).tolist():
+                touch, patch = lane[number]
+                during = order[first[number] : last[number]]
+                position[row][:, during] = touch.positions(times_s[during])
+                force[row, during] = touch.forces(times_s[during])
+                patches[row][:, during] = np.outer(
+                    [patch.radius_m, *patch.focus_m], patch.growth(force[row, during])
+                )
         return position, force, patches
 
     def tangential_n(self, times_s: FloatArray) -> FloatArray:
