@@ -253,6 +253,53 @@ def test_open_electrode_is_a_dead_electrode() -> None:
     assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.DEAD_ELECTRODE, ("y0",))]
 
 
+def loose(t: float, until_s: float = np.inf) -> Counts:
+    """Presses of half a second; xa opens and closes in each of them, from 3 s on."""
+    network = model().networks[0]
+    part = t % 1.0
+    if not (3 < t < until_s and 0.2 < part < 0.35) or part > 0.5:
+        return presses(t)
+    rng = np.random.default_rng(int(t))
+    x, y = rng.uniform(0.1, 0.9, 2)
+    broken = network.with_series_ohm([0, np.inf, 0, 0])
+    fractions = broken.fractions(x * network.a, y * network.b)
+    return np.asarray(fractions * 0.95 * np.exp(rng.uniform(6, 9)))
+
+
+def test_electrode_that_opens_and_closes_is_a_dead_electrode_part_of_the_time() -> None:
+    _, changes = play(lambda t, _: loose(t), 30)
+    (found,) = changes
+    assert (found.kind, found.electrodes) == (FaultKind.DEAD_ELECTRODE, ("xa",))
+    assert "electrode xa is open part of the time" in found.published.cause
+    assert found.published.since_ns < 10 * SECOND
+    assert not found.published.position_valid
+
+
+def test_loose_electrode_isnt_left_out_of_the_location_of_contacts() -> None:
+    """Its contacts would be located wrongly while it is connected."""
+    diagnosis, _ = play(lambda t, _: loose(t), 15)
+    assert diagnosis.diagnoses()
+    assert diagnosis.dead_electrodes() == {}
+
+
+def test_loose_electrode_ends_when_contacts_stay_connected() -> None:
+    diagnosis, changes = play(lambda t, _: loose(t, 12), 90)
+    assert diagnosis.diagnoses() == []
+    (ended,) = (change for change in changes if change.until_ns is not None)
+    assert ended.electrodes == ("xa",)
+
+
+def test_contacts_that_jump_from_sample_to_sample_are_no_loose_electrode() -> None:
+    """Also from and to the electrodes, where other channels read zero."""
+
+    def jumping(t: float, _: np.random.Generator) -> Counts:
+        rng = np.random.default_rng(int(t * 10))
+        return fractions(*np.clip(rng.uniform(-0.3, 1.3, 2), 0.01, 0.99)) * np.exp(rng.uniform(7.0, 7.3))
+
+    _, changes = play(jumping, 60)
+    assert not [change for change in changes if change.kind == FaultKind.DEAD_ELECTRODE]
+
+
 def test_swapped_cables_are_named() -> None:
     diagnosis, _ = play(lambda t, _: presses(t)[[0, 3, 2, 1]], 40)
     assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [

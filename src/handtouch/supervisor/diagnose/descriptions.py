@@ -1,7 +1,7 @@
 """Cause, remedy and consequences of each fault in plain language.
 
-Public: `describe_channel_faults`, `describe_static_load`, `describe_contact_fault`, each from what a detector
-found to a `PadDiagnosis`; `named_electrodes`.
+Public: `describe_channel_faults`, `describe_static_load`, `describe_contact_fault`,
+`describe_loose_electrode`, each from what a detector found to a `PadDiagnosis`; `named_electrodes`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.supervisor.diagnose.channel_faults import ChannelFault
 from handtouch.supervisor.diagnose.contact_faults import ContactFault
+from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrode
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, PadDiagnosis
 from handtouch.supervisor.diagnose.static_load import StaticLoad
 from handtouch.wire.diagnosis import Diagnosis
@@ -202,6 +203,30 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
         force_valid=force_valid,
     )
     return PadDiagnosis(published, model.links[pad], values, names)
+
+
+def describe_loose_electrode(model: DiagnosisModel, pad: int, loose: LooseElectrode) -> PadDiagnosis:
+    """Return the diagnosis of an electrode that opens and closes: `dead_electrode`, part of the time."""
+    name, values = model.electrodes[pad][loose.channel], loose.evidence
+    cause = (
+        f"electrode {name} is open part of the time: under contacts, its current stops and returns from one "
+        "sample to the next, and the other electrodes take it over"
+    )
+    remedy = (
+        "move the cable while the pad is pressed to find the loose contact: wire, crimp, socket, or the glue "
+        "between electrode and sheet"
+    )
+    published = Diagnosis(
+        FaultKind.DEAD_ELECTRODE,
+        cause,
+        _evidence_text(values),
+        remedy,
+        loose.since_ns,
+        loose.confidence,
+        position_valid=False,
+        force_valid=False,
+    )
+    return PadDiagnosis(published, model.links[pad], values, (name,))
 
 
 def _evidence_text(values: Mapping[str, float]) -> str:

@@ -1,7 +1,8 @@
-"""Diagnosis of a hand: from blocks of samples to diagnoses, by three detectors.
+"""Diagnosis of a hand: from blocks of samples to diagnoses, by four detectors.
 
-Public: `HandDiagnostics`. `channel_faults` checks single samples, `static_load` what persists,
-`contact_faults` what begins and ends; each leaves out pads in which the former found a fault.
+Public: `HandDiagnostics`. `channel_faults` checks single samples, `loose_electrodes` steps between samples,
+`static_load` what persists, `contact_faults` what begins and ends; each leaves out pads in which
+`channel_faults` found a fault, and the last those with a loose electrode.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from handtouch.supervisor.diagnose.contact_faults import ContactFaultDetector
 from handtouch.supervisor.diagnose.descriptions import (
     describe_channel_faults,
     describe_contact_fault,
+    describe_loose_electrode,
     describe_static_load,
     named_electrodes,
 )
@@ -28,6 +30,7 @@ from handtouch.supervisor.diagnose.features import (
     extract_features,
 )
 from handtouch.supervisor.diagnose.hypotheses import MIN_CHANNELS, ContactCurrents, HypothesisTables
+from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrodeDetector
 from handtouch.supervisor.diagnose.model import (
     DiagnosisModel,
     FloatArray,
@@ -62,6 +65,7 @@ class HandDiagnostics:
         n = len(model.links)
         noise = np.hypot(model.noise_counts, 12**-0.5)
         self._channels = ChannelFaultDetector(model)
+        self._loose = LooseElectrodeDetector(model)
         self._weights = [electrode_weights(network) for network in model.networks]
         self._static_loads = StaticLoadDetector(noise, self._weights)
         self._mean_noise_counts = noise / np.sqrt(GROUP_SAMPLES)
@@ -95,6 +99,7 @@ class HandDiagnostics:
 
     def reset_contacts(self, pad: int) -> None:
         """Discard the contacts of a pad, whose calibration or node was replaced."""
+        self._loose.reset(pad)
         if pad in self._contact_detectors:
             self._contact_detectors[pad].reset(self._gain_covariance(pad))
 
@@ -112,6 +117,8 @@ class HandDiagnostics:
         self._static_loads.process_block(
             sample_ns, counts, np.repeat(healthy[:, None], counts.shape[2], axis=1).astype(np.float64)
         )
+        self._loose.process_block(block, self._offsets + self._static_loads.zero_counts, healthy)
+        healthy[list(self._loose.loose)] = False
         self._process_contacts(features, counts, healthy)
         return self._update_diagnoses(self._collect_diagnoses(), sample_ns)
 
@@ -183,6 +190,10 @@ class HandDiagnostics:
             fault = detector.fault
             if pad not in faulty and fault is not None:
                 active[pad, fault.kind] = describe_contact_fault(self._model, pad, fault)
+        for pad, loose in self._loose.loose.items():
+            if pad not in faulty:
+                diagnosis = describe_loose_electrode(self._model, pad, loose)
+                active[pad, diagnosis.kind] = diagnosis
         return active
 
     def _update_diagnoses(

@@ -175,6 +175,11 @@ class StaticLoadDetector:
                 load.classified_age_s = age_s
                 self._classify(pad, load, age_s)
 
+    @property
+    def zero_counts(self) -> FloatArray:
+        """Tracked zeros (n, c) of the channels, relative to the stored offsets."""
+        return self._zero
+
     def reset_zero(self, pads: FloatArray) -> None:
         """Reset the zero of some pads, (n,) bool, to their stored offsets."""
         self._zero[pads.astype(bool)] = 0.0
