@@ -31,11 +31,12 @@ from slip_runs import PerceptCollector
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
+from handtouch.core.stages.evidence import SLIP_FEATURES
 from handtouch.core.tick import TickResult
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
-from handtouch.percept.slip_evidence import SLIP_FEATURES, SlipTrees, slip_features
+from handtouch.percept.slip_evidence import SlipEvidence, SlipTrees
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
@@ -115,7 +116,7 @@ class Recorder(PerceptPublisher):
         rows = np.concatenate([result.began, result.updated])
         rows = rows[tick.slip.contact_id[rows] > 0]
         if len(rows):
-            features = slip_features(self._poses, tick.slip, rows, _PERIOD_S)
+            features = SlipEvidence(self._poses, tick.slip, _PERIOD_S).features(rows)
             self.kept.append((result.sync_ns, rows, tick.contacts.id[rows].astype(np.intp), features))
 
 

@@ -41,7 +41,7 @@ def copied(tmp_path: Path) -> Path:
 
 @needs_compiled
 @pytest.mark.parametrize(
-    "name", [f"{name}_many.py" for name in ("solve", "detect", "frames", "shear", "pairs")]
+    "name", [f"{name}_many.py" for name in ("solve", "detect", "frames", "shear", "pairs", "evidence")]
 )
 def test_compiled_and_interpreted_stages_give_the_same_bits(name: str) -> None:
     program = str(Path(__file__).with_name(name))

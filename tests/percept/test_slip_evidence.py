@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from handtouch.core.slip import SlipDetector
+from handtouch.core.stages.evidence import SLIP_FEATURES
+from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.percept.samples import ContactBuffer, ContactSamples
-from handtouch.percept.slip_evidence import SLIP_FEATURES, SlipTrees, slip_features
+from handtouch.percept.slip_evidence import SlipEvidence, SlipTrees
 
 FloatArray = NDArray[np.float64]
 PERIOD_S, PADS = 0.005, 4
@@ -18,6 +21,12 @@ PERIOD_S, PADS = 0.005, 4
 def turned(angle_rad: float) -> FloatArray:
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+
+
+def detector(n: int) -> SlipDetector:
+    """The slip stage of contacts that it knows nothing of."""
+    values, times, ids = np.full((n, VALUE_COUNT), np.nan), np.zeros(n, np.int64), np.zeros(n, np.uint32)
+    return SlipDetector(PERIOD_S, values, np.zeros(n), times, ids)
 
 
 def played(
@@ -29,8 +38,7 @@ def played(
     """
     buffer = ContactBuffer(PADS, length=22)
     n, pads = PADS, np.arange(PADS)
-    slip = SlipDetector(PERIOD_S, np.full((n, VALUE_COUNT), np.nan), np.zeros(n), np.zeros(n, np.int64),
-                        np.zeros(n, np.uint32))  # fmt: skip
+    slip = detector(n)
     for k in range(samples):
         way_m = 1e-3 * rolls_mm_per_s * k * PERIOD_S
         angle = way_m / 0.01
@@ -47,7 +55,7 @@ def played(
             sample["palm_position_m"] = origin - np.array([0.0, 0.0, 0.01])
             sample["palm_normal"] = np.tile([0.0, 0.0, -1.0], (n, 1))
         buffer.add_samples(sample)
-    values = slip_features(buffer, slip, pads, PERIOD_S)
+    values = SlipEvidence(buffer, slip, PERIOD_S).features(pads)
     assert values.shape == (PADS, len(SLIP_FEATURES))
     return dict(zip(SLIP_FEATURES, values.T, strict=True))
 
@@ -101,3 +109,111 @@ def test_trees_of_an_unknown_feature_are_refused() -> None:
 def test_shipped_trees_expect_no_slip_of_a_contact_at_rest() -> None:
     features = np.stack(list(played(22).values()), axis=1)
     assert (SlipTrees.shipped().log_odds(features) < 0).all()
+
+
+class RandomHands:
+    """Contacts that begin, end and move at random on two hands, with poses that are unknown at times."""
+
+    PADS = 9
+    HANDS = (0, 0, 0, 0, 0, 1, 1, 1, 1)
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(4)
+        self.buffer, self.slip = ContactBuffer(self.PADS, self.HANDS, 22), detector(self.PADS)
+        self._ids, self._palm_m = np.ones(self.PADS, np.uint32), self.rng.normal(0.0, 0.03, (self.PADS, 3))
+
+    def tick(self, k: int) -> NDArray[np.intp]:
+        """Add a sample of most contacts; return their pads, in no order."""
+        rng, n = self.rng, self.PADS
+        self._ids += rng.random(n) < 0.02
+        self._palm_m += rng.normal(0.0, 1e-4, (n, 3))
+        pads = np.flatnonzero(rng.random(n) < 0.9)
+        m = len(pads)
+        sample = ContactSamples(pads, np.full(m, 10**9 + 5_000_000 * k), self._ids[pads])
+        sample["pad_m"] = rng.normal(0.0, 1e-3, (m, 2))
+        sample["total_current_a"] = np.exp(rng.normal(-7.0, 1.0, m))
+        if k % 50 < 45:
+            sample["position_m"] = rng.normal(0.0, 1e-3, (m, 3))
+            sample["palm_rotation"] = Rotation.random(m, rng).as_matrix()
+            sample["palm_position_m"] = np.where(rng.random((m, 1)) < 0.05, np.nan, self._palm_m[pads])
+            normal = rng.normal(size=(m, 3))
+            sample["palm_normal"] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        self.buffer.add_samples(sample)
+        state = {name: rng.normal(0.0, 3.0, n) for name in ("log_ratio", "force_n", "force_rate_n_per_s")}
+        for name, values in {**state, "slipping": rng.random(n) < 0.3}.items():
+            self.slip.state[:, SLIP_SLICES[name].start] = values
+        return rng.permutation(pads)
+
+
+def relative_to_body(
+    buffer: ContactBuffer, pads: NDArray[np.intp], sticks: NDArray[np.bool_], pad: int, window_s: float
+) -> tuple[float, float]:
+    """Way [mm] of a contact relative to the body on others that stick, and its deviation, by regression."""
+    then = round(window_s / PERIOD_S)
+
+    def field(name: str, of: int, back: int = 0) -> FloatArray:
+        return np.asarray(buffer.latest_field(np.array([of]), name, back)[0])
+
+    def way(of: int) -> FloatArray:
+        turned = field("palm_rotation", of, then) @ (field("position_m", of) - field("position_m", of, then))
+        return np.asarray(field("palm_position_m", of) - field("palm_position_m", of, then) - turned)
+
+    known = [k for k in pads if buffer.hand_index[k] == buffer.hand_index[pad] and np.isfinite(way(k)).all()]
+    others = [k for k in known if k != pad and sticks[k]]
+    if pad not in known or not others:
+        return np.nan, np.nan
+    centre = np.mean([field("palm_position_m", k) for k in known], axis=0)
+
+    def point(of: int) -> FloatArray:
+        x, y, z = field("palm_position_m", of) - centre
+        return np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
+
+    prior = np.diag(1 / (window_s * np.repeat([0.3, 0.5], 3)))
+    rows = np.vstack([prior, *(point(k) / 1e-4 for k in others)])
+    covariance = np.linalg.inv(rows.T @ rows)
+    body = covariance @ rows.T @ np.concatenate([np.zeros(6), *(way(k) / 1e-4 for k in others)])
+    normal, own = field("palm_normal", pad), point(pad)
+    across = np.eye(3) - np.outer(normal, normal)
+    spread = across @ own @ covariance @ own.T @ across
+    off = across @ (way(pad) - own @ body)
+    return 1e3 * float(np.linalg.norm(off)), 1e3 * float(np.sqrt(np.trace(spread) / 2))
+
+
+def test_motion_against_other_contacts_is_that_of_least_squares() -> None:
+    hands = RandomHands()
+    evidence, compared = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), 0
+    for k in range(80):
+        pads = hands.tick(k)
+        found = evidence.features(pads)
+        ratio, slipping = (hands.slip.column(name) for name in ("log_ratio", "slipping"))
+        for window_s in (0.02, 0.05, 0.1):
+            at = SLIP_FEATURES.index(f"relative_mm_{1e3 * window_s:.0f}ms")
+            true = [
+                relative_to_body(hands.buffer, pads, (slipping == 0) & (ratio < 3), p, window_s) for p in pads
+            ]
+            assert found[:, [at, at + 3]] == pytest.approx(np.array(true), rel=1e-8, abs=1e-9, nan_ok=True)
+            compared += int(np.isfinite(true).all(axis=1).sum())
+    assert compared > 300
+
+
+def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
+    hands = RandomHands()
+    evidence, expected = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), np.full(RandomHands.PADS, np.nan)
+    updated_ns = np.zeros(RandomHands.PADS, np.int64)
+    for k in range(100):
+        pads, now_ns = np.sort(hands.tick(k)), 10**9 + 5_000_000 * k
+        evidence.update_odds(pads, now_ns)
+        placed = np.isfinite(hands.buffer.latest_field(pads, "palm_position_m")[:, 0])
+        hand = hands.buffer.hand_index[pads]
+        placed &= np.bincount(hand[placed], minlength=2)[hand] > 1
+        expected[pads[~placed]] = np.nan
+        due = pads[placed]
+        passed_s = (now_ns - updated_ns[due]) * 1e-9
+        kept = np.nan_to_num(expected[due], nan=-50.0) - passed_s / 0.05
+        own = SlipEvidence(hands.buffer, hands.slip, PERIOD_S).features(due)
+        expected[due] = np.maximum(SlipTrees.shipped().log_odds(own), kept)
+        updated_ns[due] = now_ns
+        assert evidence.log_odds == pytest.approx(expected, rel=1e-9, abs=1e-9, nan_ok=True)
+    before = evidence.log_odds.copy()
+    evidence.update_odds(pads, now_ns + 1_000_000)
+    assert np.array_equal(evidence.log_odds, before, equal_nan=True)

@@ -21,7 +21,7 @@ from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.slip import MOTION_CLASSES, SLIP_SLICES
 from handtouch.percept.relative_motion import LinkMotions, RelativeMotion, relative_to_object
 from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
-from handtouch.percept.slip_evidence import SlipTrees, slip_features
+from handtouch.percept.slip_evidence import SlipEvidence
 
 FloatArray = NDArray[np.float64]
 
@@ -30,9 +30,7 @@ _MIN_SAMPLES = 4  # of a contact, before which its motion is undetermined
 _REPORT_PERIOD_NS = 50_000_000
 _LIFT_OFF_HORIZON_S, _FORCE_RATE_TIME_S = 0.04, 0.02  # as in the slip stage
 _MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
-_EVIDENCE_PERIOD_NS = 5_000_000
 _MIN_SLIDING_PROBABILITY = 0.8  # of slip by joint states, while the centroid isn't known to move
-_MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
 
 
 class MotionReporter:
@@ -44,10 +42,8 @@ class MotionReporter:
     def __init__(self, slip: SlipDetector, poses: ContactBuffer, period_s: float) -> None:
         n = len(slip.contact_id)
         self._slip, self._poses, self._period_s = slip, poses, period_s
-        self._trees = SlipTrees.shipped()
-        self._log_odds = np.full(n, np.nan)
-        """ln of the odds of slip by joint states, NaN without"""
-        self._evidence_ns = np.zeros(n, dtype=np.int64)
+        self._evidence = SlipEvidence(poses, slip, period_s)
+        self._log_odds = self._evidence.log_odds
         self._last_report_ns = np.zeros(n, dtype=np.int64)
         self._detected_label = np.zeros(n, dtype=np.intp)
         self._reported_contact = np.zeros(n, dtype=np.uint32)
@@ -62,9 +58,8 @@ class MotionReporter:
         self._reported_contact[fresh] = slip.contact_id[fresh]
         self._detected_label[fresh] = -1
         self._last_report_ns[fresh] = 0
-        self._log_odds[fresh] = np.nan
-        self._evidence_ns[fresh] = 0
-        self._update_evidence(pads, now_ns)
+        self._evidence.restart_contacts(fresh)
+        self._evidence.update_odds(pads, now_ns)
         due = self._pads_to_report(pads, now_ns)
         if not len(due):
             return []
@@ -78,22 +73,6 @@ class MotionReporter:
         return [self._percept(pad, now_ns, lifted) for pad in pads.tolist()]
 
     # Details ----------------------------------------------------------------------------------------------
-
-    def _update_evidence(self, pads: IntArray, now_ns: int) -> None:
-        """Update the odds of slip by joint states, of contacts on hands that touch with several pads."""
-        placed = np.isfinite(self._poses.latest_field(pads, "palm_position_m")[:, 0])
-        placed &= self._poses.sample_count[pads] > 0
-        hand = self._poses.hand_index[pads]
-        placed &= np.bincount(hand[placed], minlength=int(hand.max()) + 1)[hand] > 1
-        self._log_odds[pads[~placed]] = np.nan
-        pads = pads[placed & (now_ns - self._evidence_ns[pads] >= 0.9 * _EVIDENCE_PERIOD_NS)]
-        if not len(pads):
-            return
-        features = slip_features(self._poses, self._slip, pads, self._period_s)
-        passed_s = (now_ns - self._evidence_ns[pads]) * 1e-9
-        kept = np.nan_to_num(self._log_odds[pads], nan=_MIN_LOG_ODDS) - passed_s / _ODDS_DECAY_S
-        self._log_odds[pads] = np.maximum(self._trees.log_odds(features), kept)
-        self._evidence_ns[pads] = now_ns
 
     def _labels(self, pads: IntArray) -> IntArray:
         """Return numbers (k,) that change with the class of a contact."""

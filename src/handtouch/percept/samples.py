@@ -1,7 +1,7 @@
 """Buffer of the latest samples of every contact, and the interface of percept estimators.
 
-Public names: `ContactBuffer`, `SampleWindow`, `ContactSamples`, `FitSchedule`, `PerceptEstimate`,
-`PerceptEstimator`.
+Public names: `ContactBuffer`, `SampleWindow`, `ContactSamples`, `FIELD_SLICES`, `FitSchedule`,
+`PerceptEstimate`, `PerceptEstimator`.
 """
 
 from __future__ import annotations
@@ -59,7 +59,8 @@ def _slices() -> tuple[dict[str, slice], int]:
     return slices, at
 
 
-_SLICES, _WIDTH = _slices()
+FIELD_SLICES, _WIDTH = _slices()
+"""Columns of a sample's fields."""
 
 
 class ContactSamples:
@@ -73,10 +74,10 @@ class ContactSamples:
         self.values = np.full((len(pads), _WIDTH), np.nan)
 
     def __getitem__(self, name: str) -> FloatArray:
-        return self.values[:, _SLICES[name]].reshape(len(self.pads), *SAMPLE_FIELDS[name])
+        return self.values[:, FIELD_SLICES[name]].reshape(len(self.pads), *SAMPLE_FIELDS[name])
 
     def __setitem__(self, name: str, values: FloatArray) -> None:
-        self.values[:, _SLICES[name]] = np.reshape(values, (len(self.pads), -1))
+        self.values[:, FIELD_SLICES[name]] = np.reshape(values, (len(self.pads), -1))
 
 
 class SampleWindow:
@@ -99,7 +100,9 @@ class SampleWindow:
         )
 
     def __getitem__(self, name: str) -> FloatArray:
-        return np.asarray(self._values[:, _SLICES[name]].reshape(len(self.sample_ns), *SAMPLE_FIELDS[name]))
+        return np.asarray(
+            self._values[:, FIELD_SLICES[name]].reshape(len(self.sample_ns), *SAMPLE_FIELDS[name])
+        )
 
 
 class ContactBuffer:
@@ -107,6 +110,8 @@ class ContactBuffer:
     contiguous.
 
     `contact_id` (n,): 0 where nothing touches; `sample_count` (n,): samples of that contact since it began.
+    `values` (n, 2 length, columns of FIELD_SLICES): sample k of a contact is at k modulo length, and `length`
+    after that.
     """
 
     def __init__(
@@ -120,7 +125,7 @@ class ContactBuffer:
         self.contact_id = np.zeros(pads, dtype=np.uint32)
         self.sample_count = np.zeros(pads, dtype=np.int64)
         self._sample_ns = np.zeros((pads, 2 * length), dtype=np.int64)
-        self._values = np.full((pads, 2 * length, _WIDTH), np.nan)
+        self.values = np.full((pads, 2 * length, _WIDTH), np.nan)
 
     def add_samples(self, sample: ContactSamples) -> IntArray:
         """Add the samples of a tick; return the pads on which a new contact began."""
@@ -132,7 +137,7 @@ class ContactBuffer:
         at = self.sample_count[pads] % self.length
         for where in (at, at + self.length):
             self._sample_ns[pads, where] = sample.sample_ns
-            self._values[pads, where] = sample.values
+            self.values[pads, where] = sample.values
         self.sample_count[pads] += 1
         return np.asarray(began)
 
@@ -145,14 +150,14 @@ class ContactBuffer:
         """Return the last samples of the contact on a pad, at most `max_samples`."""
         k = int(min(max_samples, self.sample_count[pad], self.length))
         stop = int((self.sample_count[pad] - 1) % self.length) + self.length + 1
-        return SampleWindow(self._sample_ns[pad, stop - k : stop], self._values[pad, stop - k : stop])
+        return SampleWindow(self._sample_ns[pad, stop - k : stop], self.values[pad, stop - k : stop])
 
     def latest_field(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
         """Return a field of the last sample of each pad (k, ...), or of `back` samples earlier; NaN if
         missing.
         """
         at = (self.sample_count[pads] - 1 - back) % self.length
-        values = self._values[pads, at, _SLICES[name]]
+        values = self.values[pads, at, FIELD_SLICES[name]]
         values[self.sample_count[pads] <= back] = np.nan
         return np.asarray(values.reshape(len(pads), *SAMPLE_FIELDS[name]))
 

@@ -1,0 +1,397 @@
+"""Evidence of slip by joint states: features of contacts on moving links, and boosted trees that sum it.
+
+Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`, `EVIDENCE_WORK`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from handtouch.core.stages.slip import SLIP_COUNT, SLIP_SLICES
+
+_WINDOW_MS = (10, 20, 50, 100)
+_LINK_WINDOW_MS = (20, 50, 100)  # shorter ones show the noise of encoders alone
+_HAND_WINDOW_MS = (50, 100)
+SLIP_FEATURES = (
+    "log_ratio", "slipping", "slip_mm_per_s", "onset_age_s", "relative_force_rate_per_s",
+    *(f"log_current_change_{ms}ms" for ms in _WINDOW_MS),
+    *(f"moved_mm_{ms}ms" for ms in _WINDOW_MS),
+    *(f"turned_rad_{ms}ms" for ms in _LINK_WINDOW_MS),
+    *(f"link_moved_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
+    *(f"relative_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
+    *(f"relative_std_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
+    *(f"hand_turned_rad_{ms}ms" for ms in _HAND_WINDOW_MS),
+)  # fmt: skip
+"""Names of features; each is NaN where a contact or its link's pose hasn't been known for long enough.
+
+log_ratio to relative_force_rate: of the slip stage. Over windows: change of ln of the total current; way of
+the centroid on the pad; rotation of the link in the palm; tangential way of the link's material at the
+contact; that way relative to a rigid body on the hand's other contacts, and the deviation of that body's way
+by geometry, for contacts each known within 0.1 mm; the largest rotation of a touched link of the hand."""
+EVIDENCE_WINDOWS_S = tuple(1e-3 * ms for ms in _WINDOW_MS)
+"""Windows [s] of features."""
+EVIDENCE_FIELDS = (
+    "pad_m", "total_current_a", "position_m", "palm_position_m", "palm_normal", "palm_rotation",
+)  # fmt: skip
+"""Fields of samples that features are computed from, in the order of `EvidenceStage.offsets`."""
+
+_COUNT, _WINDOWS, _LINK_WINDOWS, _HAND_WINDOWS = len(SLIP_FEATURES), 4, 3, 2
+_LOG_RATIO, _SLIPPING, _SPEED, _ONSET_AGE, _FORCE_RATE = 0, 1, 2, 3, 4
+_CURRENT_CHANGE = 5
+_MOVED = _CURRENT_CHANGE + _WINDOWS
+_TURNED = _MOVED + _WINDOWS
+_LINK_MOVED = _TURNED + _LINK_WINDOWS
+_RELATIVE = _LINK_MOVED + _LINK_WINDOWS
+_RELATIVE_STD = _RELATIVE + _LINK_WINDOWS
+_HAND_TURNED = _RELATIVE_STD + _LINK_WINDOWS
+_PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION = 0, 1, 2, 3, 4, 5
+
+_SLIP_ROW = SLIP_COUNT
+_ROW_LOG_RATIO, _ROW_SLIPPING, _ROW_ONSET_AGE, _ROW_FORCE, _ROW_RATE, _ROW_VELOCITY = (
+    SLIP_SLICES["log_ratio"].start,
+    SLIP_SLICES["slipping"].start,
+    SLIP_SLICES["onset_age_s"].start,
+    SLIP_SLICES["force_n"].start,
+    SLIP_SLICES["force_rate_n_per_s"].start,
+    SLIP_SLICES["slip_velocity_m_per_s"].start,
+)
+_MAX_LOG_RATIO = 60.0
+_MIN_LOG_RATIO = -20.0
+_MIN_FORCE_N = 0.05
+_CONTACT_VARIANCE_M2 = 1e-4 * 1e-4
+_OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S = 0.3, 0.5  # priors of a held object
+_MAX_HOLDING_LOG_RATIO = 3.0  # ln R of a contact that counts as sticking to the object
+_UPDATE_NS = 4_500_000
+_MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
+_MIN_PIVOT = 1e-6  # information is that of the prior at least, 1e3 and more
+_NAN, _INFINITY = float("nan"), float("inf")
+
+_MOTION = 6  # velocity and rotation of a rigid body
+_INFORMATION, _WEIGHTED, _FACTOR, _BODY, _POINT, _OFF = 0, 36, 42, 78, 84, 102
+EVIDENCE_WORK = 105
+
+
+class EvidenceStage:
+    """Evidence of slip of the contacts of n pads; arrays are flat, with a row a pad.
+
+    history: (n 2 length width,) and sample_count: (n,), those of a `ContactBuffer`; offsets: (6,) of
+    EVIDENCE_FIELDS in a sample. steps: (4,) samples in each of the `windows` (4,) [s]. hands: (n,) number of
+    each pad's hand. slip: (n SLIP_COUNT,) of the slip stage. tested, thresholds: (t d,) features and
+    thresholds of t trees of d levels; leaves: (t 2^d,).
+
+    Results: features (n SLIP_FEATURES,); log_odds (n,) of slip, NaN where unknown, and the times
+    evidence_ns (n,) of the last update. ways: (n 3,), due: (n,), work: (EVIDENCE_WORK,), working memory.
+    """
+
+    def __init__(
+        self,
+        history: memoryview[float],
+        sample_count: memoryview[int],
+        length: int,
+        width: int,
+        offsets: memoryview[int],
+        steps: memoryview[int],
+        windows: memoryview[float],
+        hands: memoryview[int],
+        slip: memoryview[float],
+        tested: memoryview[int],
+        thresholds: memoryview[float],
+        leaves: memoryview[float],
+        levels: int,
+        features: memoryview[float],
+        log_odds: memoryview[float],
+        evidence_ns: memoryview[int],
+        ways: memoryview[float],
+        due: memoryview[int],
+        work: memoryview[float],
+    ) -> None:
+        self.history, self.sample_count, self.length, self.width = history, sample_count, length, width
+        self.offsets, self.steps, self.windows = offsets, steps, windows
+        self.hands, self.slip = hands, slip
+        self.tested, self.thresholds, self.leaves, self.levels = tested, thresholds, leaves, levels
+        self.trees = len(tested) // levels
+        self.features, self.log_odds, self.evidence_ns = features, log_odds, evidence_ns
+        self.ways, self.due, self.work = ways, due, work
+
+    def update_odds(self, pads: memoryview[int], now_ns: int) -> None:
+        """Update the odds of slip of the contacts on these pads, ascending, by samples up to `now_ns`.
+
+        They are NaN on a hand that touches with one pad alone, or whose links' poses are unknown. Contacts
+        updated within 4.5 ms are left out.
+        """
+        count = first = 0
+        while first < len(pads):
+            stop, placed = first, 0
+            while stop < len(pads) and self.hands[pads[stop]] == self.hands[pads[first]]:
+                placed += _is_placed(self, pads[stop])
+                stop += 1
+            for k in range(first, stop):
+                pad = pads[k]
+                if placed < 2 or not _is_placed(self, pad):
+                    self.log_odds[pad] = _NAN
+                elif now_ns - self.evidence_ns[pad] >= _UPDATE_NS:
+                    self.due[count] = pad
+                    count += 1
+            first = stop
+        _compute_features(self, self.due, count)
+        for k in range(count):
+            pad = self.due[k]
+            before = self.log_odds[pad] if self.log_odds[pad] > _MIN_LOG_ODDS else _MIN_LOG_ODDS
+            kept = before - (now_ns - self.evidence_ns[pad]) * 1e-9 / _ODDS_DECAY_S
+            found = _sum_trees(self, pad)
+            self.log_odds[pad] = found if found > kept else kept
+            self.evidence_ns[pad] = now_ns
+
+    def compute_features(self, pads: memoryview[int]) -> None:
+        """Compute the features of the contacts on these pads alone."""
+        _compute_features(self, pads, len(pads))
+
+    def sum_trees(self, pad: int) -> float:
+        """Return ln of the odds of slip by the features of a pad."""
+        return _sum_trees(self, pad)
+
+
+def _is_placed(stage: EvidenceStage, pad: int) -> bool:
+    """Return True if the pose of the link under a contact is known."""
+    at = _sample_at(stage, pad, 0)
+    if at < 0:
+        return False
+    return -_INFINITY < stage.history[at + stage.offsets[_PALM_POSITION]] < _INFINITY
+
+
+def _sample_at(stage: EvidenceStage, pad: int, back: int) -> int:
+    """Return the index of a pad's last sample, or of `back` samples earlier; -1 if missing."""
+    last = stage.sample_count[pad] - 1
+    if back > last or back >= stage.length:
+        return -1
+    return (2 * pad * stage.length + (last - back) % stage.length) * stage.width
+
+
+def _sum_trees(stage: EvidenceStage, pad: int) -> float:
+    """Return the sum of the leaves that a pad's features reach; an unknown feature is above no threshold."""
+    levels, row, total, node, size = stage.levels, pad * _COUNT, 0.0, 0, 1
+    for _ in range(levels):
+        size += size
+    for tree in range(stage.trees):
+        leaf, bit = tree * size, 1
+        for _ in range(levels):
+            if stage.features[row + stage.tested[node]] > stage.thresholds[node]:
+                leaf += bit
+            bit += bit
+            node += 1
+        total += stage.leaves[leaf]
+    return total
+
+
+def _compute_features(stage: EvidenceStage, pads: memoryview[int], count: int) -> None:
+    """Compute the features of contacts on the first `count` of these pads, hand by hand."""
+    first = 0
+    while first < count:
+        stop = first
+        while stop < count and stage.hands[pads[stop]] == stage.hands[pads[first]]:
+            _compute_own_features(stage, pads[stop])
+            stop += 1
+        for link_window in range(_LINK_WINDOWS):
+            for k in range(first, stop):
+                _compute_link_motion(stage, pads[k], link_window)
+            _compute_relative_motion(stage, pads, first, stop, link_window)
+        for hand_window in range(_HAND_WINDOWS):
+            turned, largest = _TURNED + _LINK_WINDOWS - _HAND_WINDOWS + hand_window, 0.0
+            for k in range(first, stop):
+                angle = stage.features[pads[k] * _COUNT + turned]
+                if angle > largest:
+                    largest = angle
+            for k in range(first, stop):
+                stage.features[pads[k] * _COUNT + _HAND_TURNED + hand_window] = largest
+        first = stop
+
+
+def _compute_own_features(stage: EvidenceStage, pad: int) -> None:
+    """Compute the features of the slip stage, and those from current and centroid."""
+    row, state, history = pad * _COUNT, pad * _SLIP_ROW, stage.history
+    features, slip = stage.features, stage.slip
+    ratio = slip[state + _ROW_LOG_RATIO]
+    if ratio > _MAX_LOG_RATIO:
+        ratio = _MAX_LOG_RATIO
+    elif ratio < _MIN_LOG_RATIO:
+        ratio = _MIN_LOG_RATIO
+    force = slip[state + _ROW_FORCE]
+    x, y = slip[state + _ROW_VELOCITY], slip[state + _ROW_VELOCITY + 1]
+    features[row + _LOG_RATIO], features[row + _SLIPPING] = ratio, slip[state + _ROW_SLIPPING]
+    features[row + _SPEED] = 1e3 * math.sqrt(x * x + y * y)
+    features[row + _ONSET_AGE] = slip[state + _ROW_ONSET_AGE]
+    features[row + _FORCE_RATE] = slip[state + _ROW_RATE] / (force if force > _MIN_FORCE_N else _MIN_FORCE_N)
+    now = _sample_at(stage, pad, 0)
+    for window in range(_WINDOWS):
+        features[row + _CURRENT_CHANGE + window] = features[row + _MOVED + window] = _NAN
+        before = _sample_at(stage, pad, stage.steps[window])
+        if before < 0:
+            continue
+        at = stage.offsets[_CURRENT]
+        current, earlier = history[now + at], history[before + at]
+        if current > 0.0 and earlier > 0.0:
+            features[row + _CURRENT_CHANGE + window] = math.log(current / earlier)
+        at = stage.offsets[_PAD_M]
+        x, y = history[now + at] - history[before + at], history[now + at + 1] - history[before + at + 1]
+        features[row + _MOVED + window] = 1e3 * math.sqrt(x * x + y * y)
+
+
+def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> None:
+    """Compute rotation and way of the link's material at the contact over a window, NaN where unknown."""
+    row, at, history, features = pad * _COUNT, 3 * pad, stage.history, stage.features
+    ways = stage.ways
+    features[row + _TURNED + link_window] = features[row + _LINK_MOVED + link_window] = _NAN
+    features[row + _RELATIVE + link_window] = features[row + _RELATIVE_STD + link_window] = _NAN
+    ways[at] = _NAN
+    now = _sample_at(stage, pad, 0)
+    before = _sample_at(stage, pad, stage.steps[_WINDOWS - _LINK_WINDOWS + link_window])
+    if before < 0:
+        return
+    r, q = now + stage.offsets[_ROTATION], before + stage.offsets[_ROTATION]
+    p, o = now + stage.offsets[_POSITION], before + stage.offsets[_POSITION]
+    a, b, c = history[p] - history[o], history[p + 1] - history[o + 1], history[p + 2] - history[o + 2]
+    p, o = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION]
+    n = now + stage.offsets[_NORMAL]
+    along = 0.0
+    for i in range(3):
+        on_link = history[q + 3 * i] * a + history[q + 3 * i + 1] * b + history[q + 3 * i + 2] * c
+        ways[at + i] = history[p + i] - history[o + i] - on_link
+        along += ways[at + i] * history[n + i]
+    x = y = z = squares = 0.0
+    for i in range(3):  # columns of the rotations; their cross products sum to twice the axis
+        x += history[q + 3 + i] * history[r + 6 + i] - history[q + 6 + i] * history[r + 3 + i]
+        y += history[q + 6 + i] * history[r + i] - history[q + i] * history[r + 6 + i]
+        z += history[q + i] * history[r + 3 + i] - history[q + 3 + i] * history[r + i]
+        off = ways[at + i] - along * history[n + i]
+        squares += off * off
+    features[row + _TURNED + link_window] = 0.5 * math.sqrt(x * x + y * y + z * z)
+    features[row + _LINK_MOVED + link_window] = 1e3 * math.sqrt(squares)
+
+
+def _is_known(stage: EvidenceStage, pad: int) -> bool:
+    """Return True if the way of a contact's link over the window is known."""
+    at = 3 * pad
+    return -_INFINITY < stage.ways[at] + stage.ways[at + 1] + stage.ways[at + 2] < _INFINITY
+
+
+def _is_holding(stage: EvidenceStage, pad: int) -> bool:
+    """Return True if a contact counts as sticking to the object."""
+    row = pad * _COUNT
+    slipping, ratio = stage.features[row + _SLIPPING], stage.features[row + _LOG_RATIO]
+    return slipping == 0.0 and ratio < _MAX_HOLDING_LOG_RATIO
+
+
+def _compute_relative_motion(
+    stage: EvidenceStage, pads: memoryview[int], first: int, stop: int, link_window: int
+) -> None:
+    """Compute the ways of a hand's contacts, each relative to a rigid body on the other holding contacts, and
+    the deviation of a component of that body's way."""
+    work, history, known, holding = stage.work, stage.history, 0, 0
+    x = y = z = 0.0
+    for k in range(first, stop):
+        if _is_known(stage, pads[k]):
+            at = _sample_at(stage, pads[k], 0) + stage.offsets[_PALM_POSITION]
+            x, y, z = x + history[at], y + history[at + 1], z + history[at + 2]
+            known += 1
+    if known < 2:
+        return
+    x, y, z = x / known, y / known, z / known
+    window_s = stage.windows[_WINDOWS - _LINK_WINDOWS + link_window]
+    speed, rotation = _OBJECT_SPEED_STD_M_PER_S * window_s, _OBJECT_ROTATION_STD_RAD_PER_S * window_s
+    for i in range(_FACTOR):
+        work[_INFORMATION + i] = 0.0
+    for i in range(3):
+        work[_INFORMATION + 7 * i] = 1.0 / (speed * speed)
+        work[_INFORMATION + 7 * (i + 3)] = 1.0 / (rotation * rotation)
+    for k in range(first, stop):
+        if _is_known(stage, pads[k]) and _is_holding(stage, pads[k]):
+            _set_point(stage, pads[k], x, y, z)
+            _add_point(stage, pads[k], 1.0)
+            holding += 1
+    for k in range(first, stop):
+        if not _is_known(stage, pads[k]):
+            continue
+        own = _is_holding(stage, pads[k])
+        if holding < (2 if own else 1):
+            continue
+        _set_point(stage, pads[k], x, y, z)
+        if own:
+            _add_point(stage, pads[k], -1.0)
+        _compare_to_body(stage, pads[k], link_window)
+        if own:
+            _set_point(stage, pads[k], x, y, z)
+            _add_point(stage, pads[k], 1.0)
+
+
+def _set_point(stage: EvidenceStage, pad: int, x: float, y: float, z: float) -> None:
+    """Set the (3, 6) ways of a contact's point per way and rotation of a body at (x, y, z)."""
+    work, at = stage.work, _sample_at(stage, pad, 0) + stage.offsets[_PALM_POSITION]
+    x, y, z = stage.history[at] - x, stage.history[at + 1] - y, stage.history[at + 2] - z
+    for i in range(3 * _MOTION):
+        work[_POINT + i] = 0.0
+    work[_POINT], work[_POINT + 7], work[_POINT + 14] = 1.0, 1.0, 1.0
+    work[_POINT + 4], work[_POINT + 5], work[_POINT + 9] = z, -y, -z
+    work[_POINT + 11], work[_POINT + 15], work[_POINT + 16] = x, y, -x
+
+
+def _add_point(stage: EvidenceStage, pad: int, sign: float) -> None:
+    """Add what the point that was set, on a pad, contributes to the body's motion."""
+    work, weight = stage.work, sign / _CONTACT_VARIANCE_M2
+    for i in range(3):
+        at, way = _POINT + _MOTION * i, stage.ways[3 * pad + i]
+        for j in range(_MOTION):
+            part = weight * work[at + j]
+            work[_WEIGHTED + j] += part * way
+            for m in range(j + 1):
+                work[_INFORMATION + _MOTION * j + m] += part * work[at + m]
+
+
+def _compare_to_body(stage: EvidenceStage, pad: int, link_window: int) -> None:
+    """Compute the way of the point that was set, on a pad, relative to the body that was added up."""
+    work, row = stage.work, pad * _COUNT
+    normal = _sample_at(stage, pad, 0) + stage.offsets[_NORMAL]
+    _factorise(work)
+    for i in range(_MOTION):  # L^-1 of the weighted ways, and of the point's three rows in place
+        work[_BODY + i] = _substitute(work, _WEIGHTED, _BODY, i)
+    along = trace = spread = 0.0
+    for i in range(3):
+        at, way = _POINT + _MOTION * i, stage.ways[3 * pad + i]
+        for j in range(_MOTION):
+            work[at + j] = _substitute(work, at, at, j)
+            way -= work[at + j] * work[_BODY + j]
+            trace += work[at + j] * work[at + j]
+        work[_OFF + i] = way
+        along += way * stage.history[normal + i]
+    squares = 0.0
+    for i in range(3):
+        off = work[_OFF + i] - along * stage.history[normal + i]
+        squares += off * off
+    for j in range(_MOTION):
+        part = 0.0
+        for i in range(3):
+            part += work[_POINT + _MOTION * i + j] * stage.history[normal + i]
+        spread += part * part
+    variance = 0.5 * (trace - spread)
+    stage.features[row + _RELATIVE + link_window] = 1e3 * math.sqrt(squares)
+    stage.features[row + _RELATIVE_STD + link_window] = 1e3 * math.sqrt(variance if variance > 0.0 else 0.0)
+
+
+def _substitute(work: memoryview[float], given: int, solved: int, i: int) -> float:
+    """Return component i of L^-1 of a vector, after the components before it were solved."""
+    value, row = work[given + i], _FACTOR + _MOTION * i
+    for j in range(i):
+        value -= work[row + j] * work[solved + j]
+    return value / work[row + i]
+
+
+def _factorise(work: memoryview[float]) -> None:
+    """Compute the Cholesky factor of the information about the body's motion."""
+    for i in range(_MOTION):
+        for j in range(i + 1):
+            value = work[_INFORMATION + _MOTION * i + j]
+            for m in range(j):
+                value -= work[_FACTOR + _MOTION * i + m] * work[_FACTOR + _MOTION * j + m]
+            if i == j:
+                work[_FACTOR + 7 * i] = math.sqrt(value if value > _MIN_PIVOT else _MIN_PIVOT)
+            else:
+                work[_FACTOR + _MOTION * i + j] = value / work[_FACTOR + 7 * j]
