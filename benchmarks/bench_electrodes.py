@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -125,6 +126,12 @@ def play_pairs(world: str, finger: int, count: int) -> list[PlayedPair]:
     return [_compare_pair(finger, contact, truths) for contact, truths in found]
 
 
+def play_finger(world: str, number: int, touches: int, pairs: int) -> tuple[Played, list[PlayedPair]]:
+    """Return estimates of single touches and of so many pairs of one drawn finger, whose sheets are solved
+    once for both."""
+    return play(world, number, touches), play_pairs(world, number, pairs) if pairs else []
+
+
 def _serve_pairs(
     model: PadModel, deployment: Deployment, hand: VirtualHand, count: int
 ) -> list[tuple[wire.Contact | None, list[GroundTruth]]]:
@@ -219,10 +226,17 @@ def main() -> None:
     page += [HEAD.format(hands=asked.hands, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1]), ""]
     record: dict[str, Any] = {}
     for world in WORLDS:
-        made = []
-        for number in range(asked.hands):
-            made.append(play(world, number, asked.touches))
-            print(f"{world}: finger {number + 1} of {asked.hands}", flush=True)
+        made, pairs = [], []
+        with ProcessPoolExecutor(min(asked.hands, os.cpu_count() or 1)) as pool:
+            tasks = [
+                pool.submit(play_finger, world, number, asked.touches, asked.pairs * (number < asked.paired))
+                for number in range(asked.hands)
+            ]
+            for number, task in enumerate(tasks):
+                played, played_pairs = task.result()
+                made.append(played)
+                pairs += played_pairs
+                print(f"{world}: finger {number + 1} of {asked.hands}", flush=True)
         found = {
             quantity: concatenate([finger.estimates[quantity] for finger in made]) for quantity in ERRORS
         }
@@ -231,8 +245,6 @@ def main() -> None:
             page += table(f"{quantity.capitalize()} in `{world}`", text, rows_of(every, quantity))
             for pad, part in slices(every, "pad"):
                 record[f"{world}, {pad}, {quantity}"] = asdict(EstimateScore.of_estimates(part))
-        pairs = [pair for number in range(asked.paired) for pair in play_pairs(world, number, asked.pairs)]
-        print(f"{world}: pairs", flush=True)
         false = np.array([one for finger in made for one in finger.false_pairs])
         text = PAIRS.format(
             low=PAIR_FORCES_N[0],

@@ -33,6 +33,7 @@ FloatArray = NDArray[np.float64]
 _DEGREE, _RADIUS_DEGREE, _ARC_RADIUS_DEGREE = 5, 4, 3  # arcs have more elements
 _MIN_GAP_FRACTION = 1e-3  # of a side
 _MIN_ARC_FRACTION = 1e-4  # of a side: shorter parts of an electrode are left out
+_MIN_STATIC_TIMES = 20  # of two contacts that don't move, from which on they are solved without a table
 _TABLE_DEGREE = 12
 _NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
 _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
@@ -80,17 +81,38 @@ class _OutlineMutualResistance(MutualResistance):
     """Green's function of a sheet of any outline with grounded electrodes, as a resistance."""
 
     def __init__(self, shape: SimulatedOutline, gaps: ElectrodeGaps | ArcEnds) -> None:
-        sheet = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
-        points = np.stack(np.meshgrid(RADIUS_NODES, RADIUS_NODES, indexing="ij")).reshape(2, -1)
-        regular = sheet.evaluate(RADIUS_NODES, RADIUS_NODES) @ sheet.regular_parts(points)
         self._outline = shape
-        self._table = regular.reshape(4 * (len(RADIUS_NODES),))
+        self._sheet = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE)
+
+    @cached_property
+    def _table(self) -> FloatArray:  # type: ignore[override]
+        """Regular parts between all nodes: takes seconds, for contacts that move."""
+        points = np.stack(np.meshgrid(RADIUS_NODES, RADIUS_NODES, indexing="ij")).reshape(2, -1)
+        regular = self._sheet.evaluate(RADIUS_NODES, RADIUS_NODES) @ self._sheet.regular_parts(points)
+        return np.asarray(regular.reshape(4 * (len(RADIUS_NODES),)))
+
+    @lru_cache(maxsize=4096)  # noqa: B019  there are few sheets
+    def static_resistance_ohm(
+        self, x: float, y: float, other_x: float, other_y: float, nearest_m: float
+    ) -> float:
+        """Return `resistance_ohm` between two static positions, without a table; cached."""
+        one, other = np.array([[x], [y]]), np.array([[other_x], [other_y]])
+        regular = self._sheet.evaluate(one[0], one[1]) @ self._sheet.regular_parts(other)
+        return float(regular[0, 0] + self._direct_part(one, other, np.array([nearest_m]))[0])
 
     def resistance_ohm(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
         """Return the resistance (n,) between positions (2, n) [fractions], at least `nearest_m` apart."""
+        is_static = all((values == values[..., :1]).all() for values in (one, other, nearest_m))
+        if is_static and len(nearest_m) >= _MIN_STATIC_TIMES:
+            positions = (*one[:, 0].tolist(), *other[:, 0].tolist())
+            return np.full(len(nearest_m), self.static_resistance_ohm(*positions, float(nearest_m[0])))
+        return np.asarray(self._regular_part(one, other) + self._direct_part(one, other, nearest_m))
+
+    def _direct_part(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
+        """Return the resistance (n,) on an infinite sheet, to a constant."""
         apart = _stretched(self._outline, one)[0] - _stretched(self._outline, other)[0]
         distance = np.maximum(np.hypot(*apart), nearest_m / self._outline.stretch_at(one))
-        return np.asarray(self._regular_part(one, other) - np.log(distance) / (2 * math.pi))
+        return np.asarray(-np.log(distance) / (2 * math.pi))
 
 
 @lru_cache(maxsize=24)
@@ -241,7 +263,7 @@ class _OutlineSheet:
                 here = slice(f * points, (f + 1) * points)
                 mine = slice(f * self._degree, f * self._degree + count)
                 value, slope = q.values[here, mine], q.slopes[here, mine]
-                by_p, by_q = np.kron(by, value), np.kron(at, slope)
+                by_p, by_q = _kronecker(by, value), _kronecker(at, slope)
                 pp, qq, pq = (tensor[pick, here].reshape(-1, 1) for tensor in tensors)
                 local = by_p.T @ (pp * by_p + pq * by_q) + by_q.T @ (qq * by_q + pq * by_p)
                 nodes = number[own, mine].ravel()
@@ -250,6 +272,12 @@ class _OutlineSheet:
                 values.append(local.ravel())
         indices = np.concatenate(rows), np.concatenate(columns)
         return coo_array((np.concatenate(values), indices), shape=2 * (number.size,)).tocsr()
+
+
+def _kronecker(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return `numpy.kron` of two matrices, without its overhead."""
+    rows, columns = one.shape[0] * other.shape[0], one.shape[1] * other.shape[1]
+    return np.asarray((one[:, None, :, None] * other[None, :, None, :]).reshape(rows, columns))
 
 
 def _distinct(ends: list[float]) -> list[float]:
