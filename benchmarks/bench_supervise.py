@@ -354,6 +354,7 @@ def force_row(some: Estimates, **names: str) -> dict[str, Any]:
     good = some.where(some.valid)
     inside = good.distances() <= 1.96
     raw, error = rms(good.columns["uncompensated"]), rms(good.error)
+    pads = good.columns["pad"]
     return {
         **names,
         "touches": len(some),
@@ -362,9 +363,9 @@ def force_row(some: Estimates, **names: str) -> dict[str, Any]:
         "compensated, N": error,
         "ratio": f"{error / raw:.2f}",
         "in 95 %": str(Share.of_mask(inside)),
-        "by pad": str(ClusterShare.of_mask(inside, good.columns["pad"])),
-        "median width, N": 2 * 1.96 * float(np.median(np.sqrt(good.covariance))),
-        "valid, %": f"{100 * some.valid.mean():.1f}",
+        "by pad": str(ClusterShare.of_mask(inside, pads)) if len(np.unique(pads)) > 1 else "-",
+        "median width, N": 2 * 1.96 * float(np.median(np.sqrt(good.covariance))) if len(good) else math.nan,
+        "valid, %": f"{100 * some.valid.mean():.1f}" if len(some) else "-",
     }
 
 
