@@ -13,13 +13,16 @@ from tests.percept.test_slip_evidence import PERIOD_S, RandomHands
 
 
 def main(count: int) -> None:
-    """Update the odds of about `count` samples of random contacts on two hands."""
+    """Process about `count` samples of random contacts on two hands."""
     hands, digest, known = RandomHands(), hashlib.sha256(), 0
     found = SlipEvidence(hands.buffer, hands.slip, PERIOD_S)
     for k in range(count // RandomHands.PADS):
         pads = hands.tick(k)
         found.update_odds(pads, 10**9 + 5_000_000 * k)
-        for values in (found.log_odds, found.features(pads)):
+        found.compute_velocities(10**9 + 5_000_000 * k)
+        motion = [found.relative_motion(pad) for pad in pads.tolist()]
+        of_motion = np.array([(*one.velocity, one.std) for one in motion if one], np.float64)
+        for values in (found.log_odds, found.features(pads), of_motion):
             digest.update(np.nan_to_num(values, nan=-7.0).tobytes())
         known += int(np.isfinite(found.log_odds).sum())
     assert known > count // 3

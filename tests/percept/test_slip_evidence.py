@@ -117,17 +117,18 @@ class RandomHands:
     PADS = 9
     HANDS = (0, 0, 0, 0, 0, 1, 1, 1, 1)
 
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(4)
+    def __init__(self, missing: float = 0.1) -> None:
+        """missing: share of contacts without a sample in a tick; with 0, all last."""
+        self.rng, self._missing = np.random.default_rng(4), missing
         self.buffer, self.slip = ContactBuffer(self.PADS, self.HANDS, 22), detector(self.PADS)
         self._ids, self._palm_m = np.ones(self.PADS, np.uint32), self.rng.normal(0.0, 0.03, (self.PADS, 3))
 
     def tick(self, k: int) -> NDArray[np.intp]:
         """Add a sample of most contacts; return their pads, in no order."""
         rng, n = self.rng, self.PADS
-        self._ids += rng.random(n) < 0.02
+        self._ids += rng.random(n) < 0.2 * self._missing
         self._palm_m += rng.normal(0.0, 1e-4, (n, 3))
-        pads = np.flatnonzero(rng.random(n) < 0.9)
+        pads = np.flatnonzero(rng.random(n) >= self._missing)
         m = len(pads)
         sample = ContactSamples(pads, np.full(m, 10**9 + 5_000_000 * k), self._ids[pads])
         sample["pad_m"] = rng.normal(0.0, 1e-3, (m, 2))
@@ -146,7 +147,13 @@ class RandomHands:
 
 
 def relative_to_body(
-    buffer: ContactBuffer, pads: NDArray[np.intp], sticks: NDArray[np.bool_], pad: int, window_s: float
+    buffer: ContactBuffer,
+    pads: NDArray[np.intp],
+    sticks: NDArray[np.bool_],
+    pad: int,
+    window_s: float,
+    std_m: float = 1e-4,
+    around: int | None = None,
 ) -> tuple[float, float]:
     """Way [mm] of a contact relative to the body on others that stick, and its deviation, by regression."""
     then = round(window_s / PERIOD_S)
@@ -162,16 +169,16 @@ def relative_to_body(
     others = [k for k in known if k != pad and sticks[k]]
     if pad not in known or not others:
         return np.nan, np.nan
-    centre = np.mean([field("palm_position_m", k) for k in known], axis=0)
+    centre = np.mean([field("palm_position_m", k) for k in (known if around is None else [around])], axis=0)
 
     def point(of: int) -> FloatArray:
         x, y, z = field("palm_position_m", of) - centre
         return np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]])
 
     prior = np.diag(1 / (window_s * np.repeat([0.3, 0.5], 3)))
-    rows = np.vstack([prior, *(point(k) / 1e-4 for k in others)])
+    rows = np.vstack([prior, *(point(k) / std_m for k in others)])
     covariance = np.linalg.inv(rows.T @ rows)
-    body = covariance @ rows.T @ np.concatenate([np.zeros(6), *(way(k) / 1e-4 for k in others)])
+    body = covariance @ rows.T @ np.concatenate([np.zeros(6), *(way(k) / std_m for k in others)])
     normal, own = field("palm_normal", pad), point(pad)
     across = np.eye(3) - np.outer(normal, normal)
     spread = across @ own @ covariance @ own.T @ across
@@ -217,3 +224,25 @@ def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
     before = evidence.log_odds.copy()
     evidence.update_odds(pads, now_ns + 1_000_000)
     assert np.array_equal(evidence.log_odds, before, equal_nan=True)
+
+
+def test_velocity_against_the_object_is_that_of_least_squares() -> None:
+    hands = RandomHands(missing=0.0)
+    evidence, compared = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), 0
+    for k in range(80):
+        pads = hands.tick(k)
+        log_odds = hands.rng.normal(-4.0, 4.0, hands.PADS)
+        hands.slip.state[:, SLIP_SLICES["log_odds"].start] = log_odds
+        sticks = (hands.slip.column("slipping") == 0) & (log_odds <= -3)
+        evidence.compute_velocities(10**9 + 5_000_000 * k)
+        for pad in range(hands.PADS) if k > 12 else ():
+            found = evidence.relative_motion(pad)
+            way_mm, std_mm = relative_to_body(hands.buffer, pads, sticks, pad, 0.05, 5e-5, around=pad)
+            if found is None or not found.contacts:
+                assert np.isnan(way_mm)
+                continue
+            assert found.object == "grasp"
+            assert np.linalg.norm(found.velocity) == pytest.approx(1e-3 * way_mm / 0.05, rel=1e-8)
+            assert found.std == pytest.approx(np.hypot(1e-3, 1e-3 * std_mm / 0.05), rel=1e-8)
+            compared += 1
+    assert compared > 200

@@ -23,7 +23,6 @@ from handtouch.daemon.percept_client import PerceptClient
 from handtouch.hand.joints import JointSnapshot
 from handtouch.percept.messages import make_percept_message
 from handtouch.percept.motion import MotionReporter
-from handtouch.percept.relative_motion import VELOCITY_WINDOW_S
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.percept.slip_evidence import FEATURE_WINDOW_S
 
@@ -54,7 +53,7 @@ class PerceptPublisher:
         for hand, rows in enumerate(pipeline.model.rows_of_hand.values()):
             hand_index[rows] = hand
         period_s = pipeline.cycle.period_ns * 1e-9
-        length = round(max(VELOCITY_WINDOW_S, FEATURE_WINDOW_S) / period_s) + 2
+        length = round(FEATURE_WINDOW_S / period_s) + 2
         self._poses = ContactBuffer(pipeline.model.size, hand_index.tolist(), length)
         """latest poses of links in the palm frame"""
         self._motion = MotionReporter(pipeline.tick.slip, self._poses, period_s)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.slip import MOTION_CLASSES, SLIP_SLICES
-from handtouch.percept.relative_motion import LinkMotions, RelativeMotion, relative_to_object
+from handtouch.percept.relative_motion import RelativeMotion
 from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
 from handtouch.percept.slip_evidence import SlipEvidence
 
@@ -29,7 +29,6 @@ _ROLLING_PRIOR = 0.2  # fraction of moving centroids that roll, without joint st
 _MIN_SAMPLES = 4  # of a contact, before which its motion is undetermined
 _REPORT_PERIOD_NS = 50_000_000
 _LIFT_OFF_HORIZON_S, _FORCE_RATE_TIME_S = 0.04, 0.02  # as in the slip stage
-_MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
 _MIN_SLIDING_PROBABILITY = 0.8  # of slip by joint states, while the centroid isn't known to move
 
 
@@ -63,8 +62,8 @@ class MotionReporter:
         due = self._pads_to_report(pads, now_ns)
         if not len(due):
             return []
-        links = LinkMotions.from_buffer(self._poses, now_ns, self._period_s)
-        return [self._estimate_motion(pad, now_ns, links) for pad in due.tolist()]
+        self._evidence.compute_velocities(now_ns)
+        return [self._estimate_motion(pad, now_ns) for pad in due.tolist()]
 
     def end_contacts(self, pads: IntArray, now_ns: int) -> list[PerceptEstimate]:
         """Return the lift-off of contacts that ended on these pads."""
@@ -91,10 +90,8 @@ class MotionReporter:
             due = due[np.argsort(-waits[due], kind="stable")[:few]]
         return np.asarray(pads[np.concatenate([changed.nonzero()[0], due])])
 
-    def _estimate_motion(self, pad: int, now_ns: int, links: LinkMotions) -> PerceptEstimate:
-        slip = self._slip
-        uncertain = (slip.column("slipping") != 0) | (slip.column("log_odds") > _MAX_STICKING_LOG_ODDS)
-        relative = relative_to_object(links, pad, self._poses.hand_index, uncertain)
+    def _estimate_motion(self, pad: int, now_ns: int) -> PerceptEstimate:
+        relative = self._evidence.relative_motion(pad)
         probabilities = self._class_probabilities(pad, relative)
         self._last_report_ns[pad] = now_ns
         self._detected_label[pad] = int(self._labels(np.array([pad]))[0])

@@ -110,8 +110,8 @@ class ContactBuffer:
     contiguous.
 
     `contact_id` (n,): 0 where nothing touches; `sample_count` (n,): samples of that contact since it began.
-    `values` (n, 2 length, columns of FIELD_SLICES): sample k of a contact is at k modulo length, and `length`
-    after that.
+    `values` (n, 2 length, columns of FIELD_SLICES), `sample_ns` (n, 2 length): sample k of a contact is at k
+    modulo length, and `length` after that.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class ContactBuffer:
         )
         self.contact_id = np.zeros(pads, dtype=np.uint32)
         self.sample_count = np.zeros(pads, dtype=np.int64)
-        self._sample_ns = np.zeros((pads, 2 * length), dtype=np.int64)
+        self.sample_ns = np.zeros((pads, 2 * length), dtype=np.int64)
         self.values = np.full((pads, 2 * length, _WIDTH), np.nan)
 
     def add_samples(self, sample: ContactSamples) -> IntArray:
@@ -136,7 +136,7 @@ class ContactBuffer:
         self.contact_id[pads] = sample.contact_id
         at = self.sample_count[pads] % self.length
         for where in (at, at + self.length):
-            self._sample_ns[pads, where] = sample.sample_ns
+            self.sample_ns[pads, where] = sample.sample_ns
             self.values[pads, where] = sample.values
         self.sample_count[pads] += 1
         return np.asarray(began)
@@ -150,7 +150,7 @@ class ContactBuffer:
         """Return the last samples of the contact on a pad, at most `max_samples`."""
         k = int(min(max_samples, self.sample_count[pad], self.length))
         stop = int((self.sample_count[pad] - 1) % self.length) + self.length + 1
-        return SampleWindow(self._sample_ns[pad, stop - k : stop], self.values[pad, stop - k : stop])
+        return SampleWindow(self.sample_ns[pad, stop - k : stop], self.values[pad, stop - k : stop])
 
     def latest_field(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
         """Return a field of the last sample of each pad (k, ...), or of `back` samples earlier; NaN if
@@ -160,10 +160,6 @@ class ContactBuffer:
         values = self.values[pads, at, FIELD_SLICES[name]]
         values[self.sample_count[pads] <= back] = np.nan
         return np.asarray(values.reshape(len(pads), *SAMPLE_FIELDS[name]))
-
-    def latest_sample_ns(self, pads: IntArray, back: IntArray | int = 0) -> NDArray[np.int64]:
-        """Return the times (k,) of these samples."""
-        return np.asarray(self._sample_ns[pads, (self.sample_count[pads] - 1 - back) % self.length])
 
 
 class FitSchedule:

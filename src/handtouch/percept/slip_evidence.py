@@ -29,6 +29,7 @@ from handtouch.core.stages.evidence import (
     SLIP_FEATURES,
     EvidenceStage,
 )
+from handtouch.percept.relative_motion import RelativeMotion
 from handtouch.percept.samples import FIELD_SLICES, ContactBuffer, IntArray
 
 FloatArray = NDArray[np.float64]
@@ -52,9 +53,11 @@ class SlipEvidence:
         self.log_odds = np.full(n, np.nan)
         self._evidence_ns = np.zeros(n, np.int64)
         self._features = np.full((n, len(SLIP_FEATURES)), np.nan)
+        self._compared = view_memory(np.zeros(5))
         steps = [max(round(window_s / period_s), 1) for window_s in EVIDENCE_WINDOWS_S]
         self._stage = EvidenceStage(
             view_memory(buffer.values),
+            view_memory(buffer.sample_ns),
             view_memory(buffer.sample_count),
             buffer.length,
             buffer.values.shape[2],
@@ -70,6 +73,8 @@ class SlipEvidence:
             view_memory(self._features),
             view_memory(self.log_odds),
             view_memory(self._evidence_ns),
+            view_memory(np.full((n, 3), np.nan)),
+            view_memory(np.full(n, np.nan)),
             view_memory(np.zeros((n, 3))),
             view_memory(np.zeros(n, np.intp)),
             view_memory(np.zeros(EVIDENCE_WORK)),
@@ -86,6 +91,17 @@ class SlipEvidence:
         They become NaN on a hand that touches with one pad alone, or whose links' poses are unknown.
         """
         self._stage.update_odds(np.sort(pads).data, now_ns)
+
+    def compute_velocities(self, now_ns: int) -> None:
+        """Compute the velocities of links over the last 50 ms, for `relative_motion`."""
+        self._stage.compute_velocities(now_ns)
+
+    def relative_motion(self, pad: int) -> RelativeMotion | None:
+        """Return the velocity of a contact's link relative to the object; None if its pose isn't known."""
+        if not self._stage.compare_to_object(pad, self._compared):
+            return None
+        x, y, z, std, contacts = self._compared
+        return RelativeMotion.of_velocity((x, y, z), std, int(contacts))
 
     def features(self, pads: IntArray) -> FloatArray:
         """Return features (k, len(SLIP_FEATURES)) of the contacts on pads (k,), by these contacts alone."""

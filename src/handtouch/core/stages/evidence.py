@@ -32,6 +32,7 @@ EVIDENCE_WINDOWS_S = tuple(1e-3 * ms for ms in _WINDOW_MS)
 """Windows [s] of features."""
 EVIDENCE_FIELDS = (
     "pad_m", "total_current_a", "position_m", "palm_position_m", "palm_normal", "palm_rotation",
+    "palm_joints_m2",
 )  # fmt: skip
 """Fields of samples that features are computed from, in the order of `EvidenceStage.offsets`."""
 
@@ -44,22 +45,26 @@ _LINK_MOVED = _TURNED + _LINK_WINDOWS
 _RELATIVE = _LINK_MOVED + _LINK_WINDOWS
 _RELATIVE_STD = _RELATIVE + _LINK_WINDOWS
 _HAND_TURNED = _RELATIVE_STD + _LINK_WINDOWS
-_PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION = 0, 1, 2, 3, 4, 5
+_PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION, _JOINTS_M2 = 0, 1, 2, 3, 4, 5, 6
 
 _SLIP_ROW = SLIP_COUNT
-_ROW_LOG_RATIO, _ROW_SLIPPING, _ROW_ONSET_AGE, _ROW_FORCE, _ROW_RATE, _ROW_VELOCITY = (
+_ROW_LOG_RATIO, _ROW_SLIPPING, _ROW_ONSET_AGE, _ROW_FORCE, _ROW_RATE, _ROW_VELOCITY, _ROW_LOG_ODDS = (
     SLIP_SLICES["log_ratio"].start,
     SLIP_SLICES["slipping"].start,
     SLIP_SLICES["onset_age_s"].start,
     SLIP_SLICES["force_n"].start,
     SLIP_SLICES["force_rate_n_per_s"].start,
     SLIP_SLICES["slip_velocity_m_per_s"].start,
+    SLIP_SLICES["log_odds"].start,
 )
 _MAX_LOG_RATIO = 60.0
 _MIN_LOG_RATIO = -20.0
 _MIN_FORCE_N = 0.05
 _CONTACT_VARIANCE_M2 = 1e-4 * 1e-4
 _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S = 0.3, 0.5  # priors of a held object
+_LINK_SPEED_STD_M_PER_S = 1e-3  # from the elasticity of links
+_VELOCITY_WINDOW, _MAX_AGE_NS = 2, 50_000_000
+_MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
 _MAX_HOLDING_LOG_RATIO = 3.0  # ln R of a contact that counts as sticking to the object
 _UPDATE_NS = 4_500_000
 _MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
@@ -74,18 +79,21 @@ EVIDENCE_WORK = 105
 class EvidenceStage:
     """Evidence of slip of the contacts of n pads; arrays are flat, with a row a pad.
 
-    history: (n 2 length width,) and sample_count: (n,), those of a `ContactBuffer`; offsets: (6,) of
-    EVIDENCE_FIELDS in a sample. steps: (4,) samples in each of the `windows` (4,) [s]. hands: (n,) number of
-    each pad's hand. slip: (n SLIP_COUNT,) of the slip stage. tested, thresholds: (t d,) features and
-    thresholds of t trees of d levels; leaves: (t 2^d,).
+    history: (n 2 length width,), sample_ns: (n 2 length,) and sample_count: (n,), those of a `ContactBuffer`;
+    offsets: (7,) of EVIDENCE_FIELDS in a sample. steps: (4,) samples in each of the `windows` (4,) [s].
+    hands: (n,) number of each pad's hand. slip: (n SLIP_COUNT,) of the slip stage. tested, thresholds: (t d,)
+    features and thresholds of t trees of d levels; leaves: (t 2^d,).
 
     Results: features (n SLIP_FEATURES,); log_odds (n,) of slip, NaN where unknown, and the times
-    evidence_ns (n,) of the last update. ways: (n 3,), due: (n,), work: (EVIDENCE_WORK,), working memory.
+    evidence_ns (n,) of the last update; velocities (n 3,) [m/s] of links at contacts in the palm, with the
+    deviation of a component in velocity_std (n,), NaN where unknown. ways: (n 3,), due: (n,), work:
+    (EVIDENCE_WORK,), working memory.
     """
 
     def __init__(
         self,
         history: memoryview[float],
+        sample_ns: memoryview[int],
         sample_count: memoryview[int],
         length: int,
         width: int,
@@ -101,16 +109,20 @@ class EvidenceStage:
         features: memoryview[float],
         log_odds: memoryview[float],
         evidence_ns: memoryview[int],
+        velocities: memoryview[float],
+        velocity_std: memoryview[float],
         ways: memoryview[float],
         due: memoryview[int],
         work: memoryview[float],
     ) -> None:
-        self.history, self.sample_count, self.length, self.width = history, sample_count, length, width
+        self.history, self.sample_ns, self.sample_count = history, sample_ns, sample_count
+        self.length, self.width = length, width
         self.offsets, self.steps, self.windows = offsets, steps, windows
         self.hands, self.slip = hands, slip
         self.tested, self.thresholds, self.leaves, self.levels = tested, thresholds, leaves, levels
         self.trees = len(tested) // levels
         self.features, self.log_odds, self.evidence_ns = features, log_odds, evidence_ns
+        self.velocities, self.velocity_std = velocities, velocity_std
         self.ways, self.due, self.work = ways, due, work
 
     def update_odds(self, pads: memoryview[int], now_ns: int) -> None:
@@ -141,6 +153,45 @@ class EvidenceStage:
             found = _sum_trees(self, pad)
             self.log_odds[pad] = found if found > kept else kept
             self.evidence_ns[pad] = now_ns
+
+    def compute_velocities(self, now_ns: int) -> None:
+        """Compute the velocities of links at all contacts that have a sample in the last 50 ms."""
+        for pad in range(len(self.hands)):
+            _compute_velocity(self, pad, now_ns)
+
+    def compare_to_object(self, pad: int, out: memoryview[float]) -> bool:
+        """Write velocity (3,) of a contact's link relative to the object, deviation of a component, and the
+        number of other contacts that determine the object's velocity; False if the link's is unknown.
+
+        The object is a rigid body that moves with its hand's contacts unless they slip or may do so, and at
+        rest in the palm without.
+        """
+        work, at = self.work, _sample_at(self, pad, 0)
+        if not self.velocity_std[pad] < _INFINITY:
+            return False
+        origin, others = at + self.offsets[_PALM_POSITION], 0
+        x, y, z = self.history[origin], self.history[origin + 1], self.history[origin + 2]
+        _set_prior(work, _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S)
+        for other in range(len(self.hands)):
+            row = other * _SLIP_ROW
+            if other == pad or self.hands[other] != self.hands[pad] or self.slip[row + _ROW_SLIPPING] != 0.0:
+                continue
+            std = self.velocity_std[other]
+            if std < _INFINITY and not self.slip[row + _ROW_LOG_ODDS] > _MAX_STICKING_LOG_ODDS:
+                _set_point(self, other, x, y, z)
+                _add_point(work, self.velocities, other, 1.0 / (std * std))
+                others += 1
+        variance = 0.0
+        if others:
+            _set_point(self, pad, x, y, z)
+            variance = _compare_to_body(self, self.velocities, pad)
+        else:
+            _remove_normal(self, self.velocities, pad)
+        for i in range(3):
+            out[i] = work[_OFF + i]
+        std = self.velocity_std[pad]
+        out[3], out[4] = math.sqrt(std * std + variance), float(others)
+        return True
 
     def compute_features(self, pads: memoryview[int]) -> None:
         """Compute the features of the contacts on these pads alone."""
@@ -238,8 +289,7 @@ def _compute_own_features(stage: EvidenceStage, pad: int) -> None:
 
 def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> None:
     """Compute rotation and way of the link's material at the contact over a window, NaN where unknown."""
-    row, at, history, features = pad * _COUNT, 3 * pad, stage.history, stage.features
-    ways = stage.ways
+    row, at, history, features, ways = pad * _COUNT, 3 * pad, stage.history, stage.features, stage.ways
     features[row + _TURNED + link_window] = features[row + _LINK_MOVED + link_window] = _NAN
     features[row + _RELATIVE + link_window] = features[row + _RELATIVE_STD + link_window] = _NAN
     ways[at] = _NAN
@@ -247,16 +297,9 @@ def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> No
     before = _sample_at(stage, pad, stage.steps[_WINDOWS - _LINK_WINDOWS + link_window])
     if before < 0:
         return
-    r, q = now + stage.offsets[_ROTATION], before + stage.offsets[_ROTATION]
-    p, o = now + stage.offsets[_POSITION], before + stage.offsets[_POSITION]
-    a, b, c = history[p] - history[o], history[p + 1] - history[o + 1], history[p + 2] - history[o + 2]
-    p, o = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION]
-    n = now + stage.offsets[_NORMAL]
-    along = 0.0
-    for i in range(3):
-        on_link = history[q + 3 * i] * a + history[q + 3 * i + 1] * b + history[q + 3 * i + 2] * c
-        ways[at + i] = history[p + i] - history[o + i] - on_link
-        along += ways[at + i] * history[n + i]
+    _compute_material_way(stage, pad, now, before)
+    r, q, n = now + stage.offsets[_ROTATION], before + stage.offsets[_ROTATION], now + stage.offsets[_NORMAL]
+    along = ways[at] * history[n] + ways[at + 1] * history[n + 1] + ways[at + 2] * history[n + 2]
     x = y = z = squares = 0.0
     for i in range(3):  # columns of the rotations; their cross products sum to twice the axis
         x += history[q + 3 + i] * history[r + 6 + i] - history[q + 6 + i] * history[r + 3 + i]
@@ -266,6 +309,44 @@ def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> No
         squares += off * off
     features[row + _TURNED + link_window] = 0.5 * math.sqrt(x * x + y * y + z * z)
     features[row + _LINK_MOVED + link_window] = 1e3 * math.sqrt(squares)
+
+
+def _compute_material_way(stage: EvidenceStage, pad: int, now: int, before: int) -> None:
+    """Compute the way in the palm, between two samples, of the link's point that is in contact now."""
+    history, q = stage.history, before + stage.offsets[_ROTATION]
+    p, o = now + stage.offsets[_POSITION], before + stage.offsets[_POSITION]
+    a, b, c = history[p] - history[o], history[p + 1] - history[o + 1], history[p + 2] - history[o + 2]
+    p, o = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION]
+    for i in range(3):
+        on_link = history[q + 3 * i] * a + history[q + 3 * i + 1] * b + history[q + 3 * i + 2] * c
+        stage.ways[3 * pad + i] = history[p + i] - history[o + i] - on_link
+
+
+def _compute_velocity(stage: EvidenceStage, pad: int, now_ns: int) -> None:
+    """Compute the velocity of the link at a contact over 50 ms, or since the contact began."""
+    stage.velocity_std[pad] = _NAN
+    back = stage.steps[_VELOCITY_WINDOW]
+    if back >= stage.sample_count[pad]:
+        back = stage.sample_count[pad] - 1
+    if back < 1:
+        return
+    now, before = _sample_at(stage, pad, 0), _sample_at(stage, pad, back)
+    last_ns, then_ns = stage.sample_ns[now // stage.width], stage.sample_ns[before // stage.width]
+    if not now_ns - last_ns <= _MAX_AGE_NS or last_ns <= then_ns:
+        return
+    _compute_material_way(stage, pad, now, before)
+    if not _is_known(stage, pad):
+        return
+    over_s = (last_ns - then_ns) * 1e-9
+    for i in range(3):
+        stage.velocities[3 * pad + i] = stage.ways[3 * pad + i] / over_s
+    variance_m2 = (
+        stage.history[now + stage.offsets[_JOINTS_M2]] + stage.history[before + stage.offsets[_JOINTS_M2]]
+    )
+    if not 0.0 <= variance_m2 < _INFINITY:
+        variance_m2 = 0.0
+    variance = variance_m2 / (over_s * over_s)  # as if independent in every sample
+    stage.velocity_std[pad] = math.sqrt(_LINK_SPEED_STD_M_PER_S * _LINK_SPEED_STD_M_PER_S + variance)
 
 
 def _is_known(stage: EvidenceStage, pad: int) -> bool:
@@ -297,16 +378,11 @@ def _compute_relative_motion(
         return
     x, y, z = x / known, y / known, z / known
     window_s = stage.windows[_WINDOWS - _LINK_WINDOWS + link_window]
-    speed, rotation = _OBJECT_SPEED_STD_M_PER_S * window_s, _OBJECT_ROTATION_STD_RAD_PER_S * window_s
-    for i in range(_FACTOR):
-        work[_INFORMATION + i] = 0.0
-    for i in range(3):
-        work[_INFORMATION + 7 * i] = 1.0 / (speed * speed)
-        work[_INFORMATION + 7 * (i + 3)] = 1.0 / (rotation * rotation)
+    _set_prior(work, _OBJECT_SPEED_STD_M_PER_S * window_s, _OBJECT_ROTATION_STD_RAD_PER_S * window_s)
     for k in range(first, stop):
         if _is_known(stage, pads[k]) and _is_holding(stage, pads[k]):
             _set_point(stage, pads[k], x, y, z)
-            _add_point(stage, pads[k], 1.0)
+            _add_point(work, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
             holding += 1
     for k in range(first, stop):
         if not _is_known(stage, pads[k]):
@@ -316,11 +392,15 @@ def _compute_relative_motion(
             continue
         _set_point(stage, pads[k], x, y, z)
         if own:
-            _add_point(stage, pads[k], -1.0)
-        _compare_to_body(stage, pads[k], link_window)
+            _add_point(work, stage.ways, pads[k], -1.0 / _CONTACT_VARIANCE_M2)
+        variance, squares, row = _compare_to_body(stage, stage.ways, pads[k]), 0.0, pads[k] * _COUNT
+        for i in range(3):
+            squares += work[_OFF + i] * work[_OFF + i]
+        stage.features[row + _RELATIVE + link_window] = 1e3 * math.sqrt(squares)
+        stage.features[row + _RELATIVE_STD + link_window] = 1e3 * math.sqrt(variance)
         if own:
             _set_point(stage, pads[k], x, y, z)
-            _add_point(stage, pads[k], 1.0)
+            _add_point(work, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
 
 
 def _set_point(stage: EvidenceStage, pad: int, x: float, y: float, z: float) -> None:
@@ -334,11 +414,19 @@ def _set_point(stage: EvidenceStage, pad: int, x: float, y: float, z: float) -> 
     work[_POINT + 11], work[_POINT + 15], work[_POINT + 16] = x, y, -x
 
 
-def _add_point(stage: EvidenceStage, pad: int, sign: float) -> None:
-    """Add what the point that was set, on a pad, contributes to the body's motion."""
-    work, weight = stage.work, sign / _CONTACT_VARIANCE_M2
+def _set_prior(work: memoryview[float], speed: float, rotation: float) -> None:
+    """Set the information about a body's motion to that of a prior of these deviations."""
+    for i in range(_FACTOR):
+        work[_INFORMATION + i] = 0.0
     for i in range(3):
-        at, way = _POINT + _MOTION * i, stage.ways[3 * pad + i]
+        work[_INFORMATION + 7 * i] = 1.0 / (speed * speed)
+        work[_INFORMATION + 7 * (i + 3)] = 1.0 / (rotation * rotation)
+
+
+def _add_point(work: memoryview[float], ways: memoryview[float], pad: int, weight: float) -> None:
+    """Add what the point that was set, of a pad, contributes to the body's motion."""
+    for i in range(3):
+        at, way = _POINT + _MOTION * i, ways[3 * pad + i]
         for j in range(_MOTION):
             part = weight * work[at + j]
             work[_WEIGHTED + j] += part * way
@@ -346,34 +434,41 @@ def _add_point(stage: EvidenceStage, pad: int, sign: float) -> None:
                 work[_INFORMATION + _MOTION * j + m] += part * work[at + m]
 
 
-def _compare_to_body(stage: EvidenceStage, pad: int, link_window: int) -> None:
-    """Compute the way of the point that was set, on a pad, relative to the body that was added up."""
-    work, row = stage.work, pad * _COUNT
+def _compare_to_body(stage: EvidenceStage, ways: memoryview[float], pad: int) -> float:
+    """Compute the tangential way, relative to the body, of the point that was set, of a pad; return the
+    variance of a component of the body's way."""
+    work = stage.work
     normal = _sample_at(stage, pad, 0) + stage.offsets[_NORMAL]
     _factorise(work)
-    for i in range(_MOTION):  # L^-1 of the weighted ways, and of the point's three rows in place
+    for i in range(_MOTION):  # L^-1 of the weighted ways, and of the point's three rows, in place
         work[_BODY + i] = _substitute(work, _WEIGHTED, _BODY, i)
     along = trace = spread = 0.0
     for i in range(3):
-        at, way = _POINT + _MOTION * i, stage.ways[3 * pad + i]
+        at, way = _POINT + _MOTION * i, ways[3 * pad + i]
         for j in range(_MOTION):
             work[at + j] = _substitute(work, at, at, j)
             way -= work[at + j] * work[_BODY + j]
             trace += work[at + j] * work[at + j]
         work[_OFF + i] = way
         along += way * stage.history[normal + i]
-    squares = 0.0
     for i in range(3):
-        off = work[_OFF + i] - along * stage.history[normal + i]
-        squares += off * off
+        work[_OFF + i] -= along * stage.history[normal + i]
     for j in range(_MOTION):
         part = 0.0
         for i in range(3):
             part += work[_POINT + _MOTION * i + j] * stage.history[normal + i]
         spread += part * part
     variance = 0.5 * (trace - spread)
-    stage.features[row + _RELATIVE + link_window] = 1e3 * math.sqrt(squares)
-    stage.features[row + _RELATIVE_STD + link_window] = 1e3 * math.sqrt(variance if variance > 0.0 else 0.0)
+    return variance if variance > 0.0 else 0.0
+
+
+def _remove_normal(stage: EvidenceStage, ways: memoryview[float], pad: int) -> None:
+    """Compute the tangential way of a pad's point, relative to a body at rest."""
+    normal, along = _sample_at(stage, pad, 0) + stage.offsets[_NORMAL], 0.0
+    for i in range(3):
+        along += ways[3 * pad + i] * stage.history[normal + i]
+    for i in range(3):
+        stage.work[_OFF + i] = ways[3 * pad + i] - along * stage.history[normal + i]
 
 
 def _substitute(work: memoryview[float], given: int, solved: int, i: int) -> float:
