@@ -32,6 +32,7 @@ from hand_touches import (
     serve,
     tangent_basis,
 )
+from linear_pads import LinearPads, squared_deviation
 from numpy.typing import NDArray
 from page import made_by, options, output_folder, table
 from scores import ClusterShare, Estimates, EstimateScore, bin_labels, concatenate, slices
@@ -50,6 +51,10 @@ WORLDS = ("default", "harsh")
 PAIRED = "middle"
 PAIR_FORCES_N = (0.3, 3.0)
 DISTANCES_MM = (8.0, 12.0, 16.0)
+LINEAR_TOTALS_A = (0.6e-3, 2.5e-3)
+LINEAR = (10, 5)
+"""Single contacts and pairs of each pad whose currents are of first order."""
+LINEAR_PER_TASK = 25
 
 
 @dataclass(frozen=True)
@@ -63,7 +68,8 @@ class Played:
 @dataclass(frozen=True)
 class PlayedPair:
     """Two touches at once: distance, whether two were reported, and of each, squared deviations of position
-    and force from the truth, and errors [m, N]; NaN without a force."""
+    and force from the truth, errors [m, N], NaN without a force, and standard deviation of the position [m].
+    """
 
     finger: int
     distance_mm: float
@@ -72,6 +78,7 @@ class PlayedPair:
     force: tuple[float, ...] = ()
     error_m: tuple[float, ...] = ()
     error_n: tuple[float, ...] = ()
+    std_m: tuple[float, ...] = ()
 
 
 def play(world: str, number: int, touches: int) -> Played:
@@ -162,8 +169,68 @@ def _compare_pair(finger: int, contact: wire.Contact | None, truths: list[Ground
         force = (np.nan if part["force_n"] is None else part["force_n"]) - truth.force_n
         std_n = np.nan if part["force_std_n"] is None else part["force_std_n"]
         squares = float(error @ np.linalg.solve(covariance, error)), float((force / std_n) ** 2)
-        rows.append((*squares, float(np.linalg.norm(error)), float(force)))
+        rows.append(
+            (*squares, float(np.linalg.norm(error)), float(force), float(np.sqrt(covariance.trace())))
+        )
     return PlayedPair(finger, distance_mm, True, *zip(*rows, strict=True))
+
+
+def play_linear(numbers: range, touches: int, pairs: int) -> tuple[list[tuple[int, float]], list[PlayedPair]]:
+    """Return finger and squared deviation of single contacts, and pairs, on pads drawn in `default` whose
+    currents follow from their parts to first order."""
+    first = drawn_world("default", numbers.start)
+    first = DrawnWorld(first.world.with_sheets(), first.seed)
+    stated = with_stated_touches(first.describe(load(shipped.path("electrodes.toml"))), first)
+    row = [pad.link for _, pad in stated.pads].index(PAIRED)
+    pads, singles, found = LinearPads(stated, row), [], []
+    low, high = np.log(LINEAR_TOTALS_A)
+    for number in numbers:
+        drawn = drawn_world("default", number)
+        deviations, gains = pads.deviations(drawn)
+        rng = np.random.default_rng((drawn.seed, 7))
+        s, t = rng.uniform(0.05, 0.95, (2, touches + pairs, 2))
+        totals = np.exp(rng.uniform(low, high, (touches + pairs, 2)))
+        totals[:touches, 1] = 0.0
+        fractions = np.tensordot(np.append(1.0, deviations), pads.fractions(s, t), 1)
+        currents = gains[:, None] * (fractions * totals).sum(axis=-1)
+        currents += pads.noise_a[:, None] * rng.normal(size=currents.shape)
+        true_m = pads.position_m(s, t)
+        for k, sample in enumerate(currents.T):
+            position_m, covariance_m2, parts = pads.solve(sample)
+            if k < touches:
+                singles.append((number, squared_deviation(position_m - true_m[k, 0], covariance_m2)))
+                continue
+            distance_mm = 1e3 * float(np.linalg.norm(true_m[k, 1] - true_m[k, 0]))
+            if np.isnan(parts[0, 0]):
+                found.append(PlayedPair(number, distance_mm, False))
+                continue
+            at, truth, unknown = parts[:, :3], true_m[k], (np.nan, np.nan)
+            if np.linalg.norm(at - truth, axis=1).sum() > np.linalg.norm(at - truth[::-1], axis=1).sum():
+                truth = truth[::-1]
+            errors = at - truth
+            squares = [
+                squared_deviation(error, part[6:15].reshape(3, 3))
+                for error, part in zip(errors, parts, strict=True)
+            ]
+            lengths = np.linalg.norm(errors, axis=1).tolist()
+            std_m = np.sqrt(parts[:, [6, 10, 14]].sum(axis=1)).tolist()
+            found.append(
+                PlayedPair(
+                    number, distance_mm, True, tuple(squares), unknown, tuple(lengths), unknown, tuple(std_m)
+                )
+            )
+    return singles, found
+
+
+def linear_rows(singles: list[tuple[int, float]]) -> list[dict[str, Any]]:
+    """Return the shares of single contacts in their regions."""
+    finger, square = (np.array(column) for column in zip(*singles, strict=True))
+    row: dict[str, Any] = {"contacts": len(singles)}
+    for level in (0.5, 0.9, 0.95, 0.99):
+        row[f"in {100 * level:g} %"] = share_of(square < -2 * np.log(1 - level), finger)
+    in_region = np.array([np.mean(square[finger == one] < 5.991) for one in np.unique(finger)])
+    row["fingers below 85 % in 95 %, %"] = f"{100 * np.mean(in_region < 0.85):.1f}"
+    return [row]
 
 
 def pair_rows(pairs: list[PlayedPair]) -> list[dict[str, Any]]:
@@ -175,9 +242,9 @@ def pair_rows(pairs: list[PlayedPair]) -> list[dict[str, Any]]:
         fingers = np.array([pair.finger for pair in own])
         some = [pair for pair in own if pair.reported]
         twice = np.repeat([pair.finger for pair in some], 2)
-        position, force, error_m, error_n = (
+        position, force, error_m, error_n, std_m = (
             np.array([value for pair in some for value in getattr(pair, name)])
-            for name in ("position", "force", "error_m", "error_n")
+            for name in ("position", "force", "error_m", "error_n", "std_m")
         )
         known = np.isfinite(force)
         rows.append(
@@ -187,6 +254,7 @@ def pair_rows(pairs: list[PlayedPair]) -> list[dict[str, Any]]:
                 "reported as two, %": share_of(np.array([p.reported for p in own]), fingers),
                 "positions in 95 %": share_of(position < 5.991, twice),
                 "median error, mm": f"{1e3 * np.median(error_m):.3g}" if len(error_m) else "-",
+                "median std, mm": f"{1e3 * np.median(std_m):.3g}" if len(std_m) else "-",
                 "greatest, mm": f"{1e3 * error_m.max():.3g}" if len(error_m) else "-",
                 "forces in 95 %": share_of(force[known] < 3.841, twice[known]),
                 "median error, N": f"{np.median(np.abs(error_n[known])):.3g}" if known.any() else "-",
@@ -217,11 +285,12 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--hands", type=int, default=40)
     parser.add_argument("--touches", type=int, default=16, help="of each pad")
-    parser.add_argument("--paired", type=int, default=16, help="fingers with pairs of touches")
-    parser.add_argument("--pairs", type=int, default=20, help="of each paired finger")
+    parser.add_argument("--paired", type=int, default=40, help="fingers with pairs of touches")
+    parser.add_argument("--pairs", type=int, default=8, help="of each paired finger")
+    parser.add_argument("--linear", type=int, default=200, help="pads whose currents are of first order")
     asked = parser.parse_args()
     if asked.quick:
-        asked.hands, asked.touches, asked.paired, asked.pairs = 2, 3, 2, 6
+        asked.hands, asked.touches, asked.paired, asked.pairs, asked.linear = 2, 3, 2, 6, 8
     page = ["# Intervals of pads with other numbers of electrodes", "", f"{made_by()}.", ""]
     page += [HEAD.format(hands=asked.hands, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1]), ""]
     record: dict[str, Any] = {}
@@ -256,6 +325,21 @@ def main() -> None:
         page += table(f"Two contacts at once in `{world}`", text, pair_rows(pairs))
         record[f"{world}, pairs"] = [asdict(pair) for pair in pairs]
         record[f"{world}, touches reported as two"] = [int(false.sum()), len(false)]
+    starts = range(0, asked.linear, LINEAR_PER_TASK)
+    singles, pairs = [], []
+    with ProcessPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
+        ranges = [range(start, min(start + LINEAR_PER_TASK, asked.linear)) for start in starts]
+        for some, more in pool.map(play_linear, ranges, *([count] * len(ranges) for count in LINEAR)):
+            singles += some
+            pairs += more
+    text = LINEAR_TEXT.format(pads=asked.linear, contacts=LINEAR[0], pairs=LINEAR[1])
+    page += table("Many pads in `default`", text, linear_rows(singles))
+    rows = [
+        {name: value for name, value in row.items() if "force" not in name and ", N" not in name}
+        for row in pair_rows(pairs)
+    ]
+    page += table("Two contacts at once on many pads in `default`", LINEAR_PAIRS, rows)
+    record["many pads"] = {"contacts": singles, "pairs": [asdict(pair) for pair in pairs]}
     out = output_folder(asked.quick)
     (out / "electrodes.md").write_text("\n".join(page))
     (out / "electrodes.json").write_text(json.dumps(record, indent=1).replace("NaN", "null") + "\n")
@@ -269,9 +353,18 @@ HEAD = """\
 "of fingers", which follow from how they differ."""
 PAIRS = """\
 Two touches at once on the pad with six electrodes, {low:g} to {high:g} N each, at uniform positions from 5 %
-of a side inside its edges; parts of the first {fingers} fingers, sheets without creep and hysteresis, for
+of a side inside its edges; parts of {fingers} fingers, sheets without creep and hysteresis, for
 which forces of two contacts aren't compensated. Reported at a false-alarm rate of 0.1 %; of the {touches}
 single touches above {false} were reported as two. Intervals are of fingers."""
+
+LINEAR_TEXT = """\
+A few fingers can't show coverage: what moves the contacts of one pad is the same for all of them, so that
+whole pads lie inside or outside of their regions. Here {pads} pads with six electrodes are drawn, of the same
+seeds, with {contacts} single contacts and {pairs} pairs each. Their currents follow from gaps, gains,
+anisotropy and size to first order of the daemon's model, without solving their sheets; total currents are
+log-uniform, 0.6 to 2.5 mA, without drift. It shows whether the likelihood and its covariance are those of
+such parts; errors of the model are in the tables above."""
+LINEAR_PAIRS = "As the table above, positions alone."
 
 
 if __name__ == "__main__":
