@@ -75,6 +75,16 @@ def test_on_a_curved_pad_the_tangential_force_lies_in_the_tangent_plane_of_the_c
     assert normal @ covariance @ normal == pytest.approx(FORCE_STD_N**2)
 
 
+def test_where_the_normal_is_along_the_pads_x_there_is_no_vector(bench: ShearBench) -> None:
+    counts = bench.counts(0, (0.15e-3, 0.1e-3), 3.0)
+    found = []
+    for tilt_rad in (0.5 * np.pi, 0.4 * np.pi):
+        bench.touch(0, 3.0, (0.0, 0.0), counts, tilt_rad)
+        bench.tick()
+        found.append((bench.state.force_vector_status[0], np.isfinite(bench.state.force_vector[0]).any()))
+    assert found == [(ForceStatus.INVALID, False), (ForceStatus.VALID, True)]
+
+
 def test_the_hysteresis_bound_is_that_of_the_greatest_force_since_the_tare(bench: ShearBench) -> None:
     stds = []
     for moved in (0.05e-3, 0.4e-3, 0.05e-3):

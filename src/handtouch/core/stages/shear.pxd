@@ -48,7 +48,7 @@ cdef void _update_force(ShearStage stage, SampleMemory memory, ShearTable table)
 cdef void _write_vector(
     ShearStage stage, ShearTable table, double fx, double fy, double normal_n) noexcept
 @cython.locals(at=Py_ssize_t, axes='double[::1]', numbers='double[::1]', part=double, length=double)
-cdef void _set_axes(ShearStage stage, ShearTable table) noexcept
+cdef bint _set_axes(ShearStage stage, ShearTable table) noexcept
 @cython.locals(first=Py_ssize_t)
 cdef double _pressure_ratio(double[::1] numbers, Py_ssize_t channel, double x, double y) noexcept
 @cython.locals(numbers='double[::1]', i=Py_ssize_t, k=Py_ssize_t, _=Py_ssize_t, inside=bint, size=double)

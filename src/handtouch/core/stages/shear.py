@@ -56,6 +56,8 @@ _MAX_MISFIT = 0.3
 """Largest rms deviation of the logarithms of the currents from those of a displacement; a broken channel has
 more"""
 _MAX_EXPONENT = 600.0
+_SMALLEST_SINE = 1e-6
+"""Of the angle between the surface's normal and the pad's x, along which tangential forces are given."""
 _PI, _ROOT_HALF, _NAN, _INFINITY = math.pi, math.sqrt(0.5), float("nan"), float("inf")
 
 
@@ -212,7 +214,8 @@ def _update_force(stage: ShearStage, memory: SampleMemory, table: ShearTable) ->
     if not (stage.position_requested[pad] and stage.force_requested[pad]):
         return
     position, force = stage.position_status[pad], stage.force_status[pad]
-    if not (known and located) or position == _POSITION_INVALID or force == _INVALID:
+    valid = known and located and position != _POSITION_INVALID and force != _INVALID
+    if not (valid and _set_axes(stage, table)):
         stage.status[pad] = _INVALID
         return
     stage.status[pad] = _VALID
@@ -224,7 +227,7 @@ def _update_force(stage: ShearStage, memory: SampleMemory, table: ShearTable) ->
 
 
 def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, normal_n: float) -> None:
-    """Write the force on the pad and its covariance in the link's frame, after `_estimate`."""
+    """Write force on the pad and covariance in the link's frame, after `_estimate` and `_set_axes`."""
     pad, numbers, gain = table.pad, table.numbers, stage.gain
     row, first = pad * _VALUES, pad * _VECTOR
     xx = xy = yy = 0.0  # covariance of the displacement: noise of channels
@@ -266,7 +269,6 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
     xx = kx * kx * xx + (common + axis_variance) * fx * fx + even
     xy = kx * ky * xy + common * fx * fy
     yy = ky * ky * yy + (common + axis_variance) * fy * fy + even
-    _set_axes(stage, table)
     axes = stage.axes
     for i in range(3):
         a, b, c = axes[3 * i], axes[3 * i + 1], axes[3 * i + 2]
@@ -277,10 +279,11 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
             stage.vector[first + 3 + 3 * i + j] = value if zz < _INFINITY else _NAN
 
 
-def _set_axes(stage: ShearStage, table: ShearTable) -> None:
+def _set_axes(stage: ShearStage, table: ShearTable) -> bool:
     """Set the axes of the surface at the contact, in the link's frame: x along the pad's, y, and the normal.
 
-    The columns of a matrix, so that it turns forces in the tangent plane to the link's frame.
+    The columns of a matrix, so that it turns forces in the tangent plane to the link's frame. Return False
+    where the normal is along the pad's x.
     """
     axes, numbers, at = stage.axes, table.numbers, table.pad * _VALUES + _NORMAL
     nx, ny, nz = stage.values[at], stage.values[at + 1], stage.values[at + 2]
@@ -288,10 +291,13 @@ def _set_axes(stage: ShearStage, table: ShearTable) -> None:
     part = ax * nx + ay * ny + az * nz
     ax, ay, az = ax - part * nx, ay - part * ny, az - part * nz
     length = math.sqrt(ax * ax + ay * ay + az * az)
+    if not length > _SMALLEST_SINE:
+        return False
     ax, ay, az = ax / length, ay / length, az / length
     axes[0], axes[3], axes[6] = ax, ay, az
     axes[1], axes[4], axes[7] = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax
     axes[2], axes[5], axes[8] = nx, ny, nz
+    return True
 
 
 def _pressure_ratio(numbers: memoryview[float], channel: int, x: float, y: float) -> float:
