@@ -210,6 +210,75 @@ def test_a_load_that_no_contact_explains_has_no_position() -> None:
     assert (published.pad_m, published.size_m) == (None, None)
 
 
+def test_offset_of_a_pad_with_gum_is_diagnosed_too() -> None:
+    """The gum keeps its begin and its position."""
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        return np.asarray(stuck(t) - np.array([0, 0, 0, 300.0 * (t > 13)]))
+
+    diagnosis, _ = play(contacts, 60)
+    offset, gum = sorted(diagnosis.diagnoses(), key=lambda found: found.kind != FaultKind.OFFSET)
+    assert (offset.kind, offset.electrodes) == (FaultKind.OFFSET, ("yb",))
+    assert gum.kind == FaultKind.GUM
+    assert abs(gum.published.since_ns - 6 * SECOND) <= SECOND
+    assert gum.published.pad_m == pytest.approx((0.3 * 0.042, 0.6 * 0.032), abs=1e-3)
+
+
+def test_offset_ends_when_its_channel_returns() -> None:
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        return np.asarray(presses(t) + np.array([0, 400.0 * (5.7 < t < 20.7), 0, 0]))
+
+    diagnosis, changes = play(contacts, 40)
+    assert diagnosis.diagnoses() == []
+    (ended,) = (change for change in changes if change.until_ns is not None)
+    assert (ended.kind, ended.electrodes) == (FaultKind.OFFSET, ("xa",))
+
+
+def test_moisture_after_an_offset_is_diagnosed_too() -> None:
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        leak = fractions(0.4, 0.4) * 2000 * max(0.0, -np.expm1(-(t - 15) / 30))
+        return np.asarray(leak + np.array([0, 300.0 * (t > 3), 0, 0]))
+
+    diagnosis, _ = play(contacts, 80)
+    assert {found.kind for found in diagnosis.diagnoses()} == {FaultKind.OFFSET, FaultKind.MOISTURE}
+
+
+@pytest.mark.parametrize("count", [5000.0, 1e6])
+def test_gum_is_diagnosed_by_the_channels_that_are_left(count: float) -> None:
+    """Of a pad with a channel that is stuck, or at the end of its range."""
+    rng = np.random.default_rng(3)
+    whole, diagnosis = model(), HandDiagnostics(model(), tables=_TABLES)
+
+    def read(times: Counts) -> NDArray[np.int64]:
+        counts = rng.normal(size=(len(times), len(whole.links), 4))
+        counts[:, 0] += [stuck(t - 10) for t in times]
+        read = np.clip(np.rint(counts), -32768, 32767).astype(np.int64)
+        read[times > 2, 0, 3] = min(count, 32767)
+        return read
+
+    run(diagnosis, read, 80)
+    lost = FaultKind.STUCK_CHANNEL if count < 1e5 else FaultKind.SATURATED_CHANNEL
+    assert {found.kind for found in diagnosis.diagnoses()} == {lost, FaultKind.GUM}
+    (gum,) = (found for found in diagnosis.diagnoses() if found.kind == FaultKind.GUM)
+    assert gum.published.pad_m is None
+
+
+def test_short_to_the_layer_is_distinguished_from_a_saturated_channel_of_the_same_pad() -> None:
+    made, network = model(), model().networks[0]
+    idle = -made.drive_v[0] * network.conductance[0] / network.sheet_ohm_per_square
+    counts = np.asarray(idle / made.ampere_per_count[0])
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        shorted = np.array([1e6, *counts[1:]]) if t > 15 else np.zeros(4)
+        return np.where([0, 0, t > 3, 0], 1e6, shorted)
+
+    diagnosis, _ = play(contacts, 30)
+    assert {(found.kind, found.electrodes) for found in diagnosis.diagnoses()} == {
+        (FaultKind.SATURATED_CHANNEL, ("y0",)),
+        (FaultKind.SHORTED_ELECTRODE, ("x0",)),
+    }
+
+
 def test_still_contact_is_no_gum_while_nothing_else_happens() -> None:
     """A robot that rests a finger on a table gives the same currents."""
     _, changes = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 120)
@@ -262,8 +331,8 @@ def loose(t: float, until_s: float = np.inf) -> Counts:
     rng = np.random.default_rng(int(t))
     x, y = rng.uniform(0.1, 0.9, 2)
     broken = network.with_series_ohm([0, np.inf, 0, 0])
-    fractions = broken.fractions(x * network.a, y * network.b)
-    return np.asarray(fractions * 0.95 * np.exp(rng.uniform(6, 9)))
+    shares = np.asarray(broken.fractions(x * network.a, y * network.b))
+    return np.asarray(shares * 0.95 * np.exp(rng.uniform(6, 9)))
 
 
 def test_electrode_that_opens_and_closes_is_a_dead_electrode_part_of_the_time() -> None:
@@ -294,7 +363,8 @@ def test_contacts_that_jump_from_sample_to_sample_are_no_loose_electrode() -> No
 
     def jumping(t: float, _: np.random.Generator) -> Counts:
         rng = np.random.default_rng(int(t * 10))
-        return fractions(*np.clip(rng.uniform(-0.3, 1.3, 2), 0.01, 0.99)) * np.exp(rng.uniform(7.0, 7.3))
+        place = np.clip(rng.uniform(-0.3, 1.3, 2), 0.01, 0.99)
+        return np.asarray(fractions(*place) * np.exp(rng.uniform(7.0, 7.3)))
 
     _, changes = play(jumping, 60)
     assert not [change for change in changes if change.kind == FaultKind.DEAD_ELECTRODE]

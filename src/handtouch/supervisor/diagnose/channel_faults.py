@@ -29,6 +29,9 @@ _MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the others ge
 # of the nominal sheet, whose resistance isn't known better; and the deviation of each from the nominal share
 _IDLE_RATIO_RANGE = (0.3, 3.0)
 _MAX_IDLE_DEVIATION, _MAX_IDLE_DEVIATION_OF_SUM = 0.3, 0.03
+_MIN_CHANNELS_OF_SHORT = 2
+_MIN_WINDOW_NS = 5_000_000_000
+"""The lowest readings of the other channels are those of the last one to two such times."""
 _FAULT_CLEAR_NS = 2_000_000_000
 
 
@@ -61,6 +64,8 @@ class ChannelFaultDetector:
         self._min_counts = np.full(
             (n, c, c), np.inf
         )  # lowest reading of each channel while another was railed
+        self._recent_min_counts = self._min_counts.copy()  # the same within the present part of a window
+        self._last_ns = np.zeros((n, 1), dtype=np.int64)
         self._idle_counts = [_idle_counts(model, row) for row in range(n)]  # (shorted, channels) of each pad
         self.faults: dict[tuple[int, int], ChannelFault] = {}
 
@@ -71,6 +76,18 @@ class ChannelFaultDetector:
         for pad, channel in self.faults:
             bad[pad, channel] = True
         return bad
+
+    @property
+    def usable_channels(self) -> NDArray[np.bool_]:
+        """Return the channels (n, c) that show static loads.
+
+        None of a pad with a short circuit, also a possible one, whose current is in all of them.
+        """
+        usable = ~self.faulty_channels & (self._railed_since_ns < 0)
+        for (pad, _), fault in self.faults.items():
+            if fault.kind == FaultKind.SHORTED_ELECTRODE or fault.confidence < 1:
+                usable[pad] = False
+        return np.asarray(usable)
 
     def process_block(self, features: BlockFeatures) -> None:
         """Update faults by the features of a block."""
@@ -83,13 +100,23 @@ class ChannelFaultDetector:
             railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
         )
         least = features.mean_counts.min(axis=0)[:, None, :]
-        self._min_counts = np.where(railed[:, :, None], np.minimum(self._min_counts, least), np.inf)
+        aged = (t_ns // _MIN_WINDOW_NS) != (self._last_ns // _MIN_WINDOW_NS)  # (n, 1)
+        recent = np.where(aged[:, :, None], self._recent_min_counts, self._min_counts)
+        self._recent_min_counts = np.where(
+            railed[:, :, None],
+            np.minimum(np.where(aged[:, :, None], np.inf, self._recent_min_counts), least),
+            np.inf,
+        )
+        self._min_counts = np.where(railed[:, :, None], np.minimum(recent, least), np.inf)
+        self._last_ns = t_ns
         stuck = self._used & (self._repeats >= self._max_repeats[:, None])
         for pad, channel in np.argwhere(railed | stuck).tolist():
             fault = self._classify(pad, channel, features)
             if fault is not None:
                 self._healthy_since_ns[pad, channel] = -1
                 before = self.faults.get((pad, channel))
+                if before is not None and self._is_settled(pad, channel, before):
+                    continue
                 if before is None or (before.kind, before.confidence) != (fault.kind, fault.confidence):
                     self.faults[pad, channel] = fault
         for pad, channel in list(self.faults):
@@ -99,6 +126,17 @@ class ChannelFaultDetector:
                 self._healthy_since_ns[pad, channel] = int(features.last_sample_ns[pad])
             elif features.last_sample_ns[pad] - self._healthy_since_ns[pad, channel] > _FAULT_CLEAR_NS:
                 del self.faults[pad, channel]
+
+    def _is_settled(self, pad: int, channel: int, before: ChannelFault) -> bool:
+        """Return whether a fault keeps its kind: it does beside a short, whose current is in all channels."""
+        if before.kind == FaultKind.SHORTED_ELECTRODE:
+            return True
+        others = {other: fault for (row, other), fault in self.faults.items() if row == pad}
+        del others[channel]
+        unknown = (self._railed_since_ns[pad] >= 0) & ~self.faulty_channels[pad]
+        return bool(unknown.any()) or any(
+            fault.kind == FaultKind.SHORTED_ELECTRODE for fault in others.values()
+        )
 
     def _classify(self, pad: int, channel: int, features: BlockFeatures) -> ChannelFault | None:
         count = int(features.last_counts[pad, channel])
@@ -110,11 +148,13 @@ class ChannelFaultDetector:
         if lasted < _MIN_RAILED_NS:
             return None
         own = slice(len(self._idle_counts[pad]))
-        others = np.delete(features.mean_counts[:, pad, own], channel, axis=1)
-        least = np.delete(self._min_counts[pad, channel, own], channel)
-        expected = np.delete(self._idle_counts[pad][channel], channel)
+        healthy = ~self.faulty_channels[pad, own] & (self._railed_since_ns[pad, own] < 0)
+        healthy[channel] = False
+        others = features.mean_counts[:, pad, own][:, healthy]
+        least = self._min_counts[pad, channel, own][healthy]
+        expected = self._idle_counts[pad][channel][healthy]
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
-        if count > 0 and _matches_short(least, expected):
+        if count > 0 and len(least) >= _MIN_CHANNELS_OF_SHORT and _matches_short(least, expected):
             return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
         untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
         if untouched or count < 0:

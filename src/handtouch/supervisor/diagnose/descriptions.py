@@ -102,14 +102,21 @@ def named_electrodes(model: DiagnosisModel, pad: int, load: StaticLoad) -> tuple
     return (model.electrodes[pad][load.channel],) if load.kind == FaultKind.OFFSET else ()
 
 
-def describe_static_load(model: DiagnosisModel, pad: int, load: StaticLoad) -> PadDiagnosis:
-    """Return the diagnosis of a classified static load."""
+def describe_static_load(
+    model: DiagnosisModel, pad: int, load: StaticLoad, is_located: bool = True
+) -> PadDiagnosis:
+    """Return the diagnosis of a classified static load; is_located: all its channels are healthy."""
     assert load.kind is not None
     kind = load.kind
     names = named_electrodes(model, pad, load)
     position: tuple[float, float] | None = None
     size: float | None = None
-    if kind in (FaultKind.GUM, FaultKind.MOISTURE, FaultKind.HELD_OBJECT, FaultKind.HYSTERESIS_TAIL):
+    if is_located and kind in (
+        FaultKind.GUM,
+        FaultKind.MOISTURE,
+        FaultKind.HELD_OBJECT,
+        FaultKind.HYSTERESIS_TAIL,
+    ):
         position, radius_m = _load_position(model, pad, load.level_counts)
         size = 2 * radius_m if kind == FaultKind.GUM and radius_m is not None else None
     cause, remedy = _STATIC_LOAD_TEXTS[kind]

@@ -1,8 +1,9 @@
-"""Diagnosis of a hand: from blocks of samples to diagnoses, by four detectors.
+"""Diagnosis of a hand: from blocks of samples to diagnoses, by five detectors.
 
-Public: `HandDiagnostics`. `channel_faults` checks single samples, `loose_electrodes` steps between samples,
-`static_load` what persists, `contact_faults` what begins and ends; each leaves out pads in which
-`channel_faults` found a fault, and the last those with a loose electrode.
+Public: `HandDiagnostics`. `channel_faults` checks single samples, `loose_electrodes` and `offset_steps` steps
+between samples, `static_load` what persists, `contact_faults` what begins and ends. `static_load` leaves out
+channels in which `channel_faults` found a fault, `contact_faults` their pads and those with a loose
+electrode.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from handtouch.supervisor.diagnose.model import (
     HandSamples,
     PadDiagnosis,
 )
+from handtouch.supervisor.diagnose.offset_steps import OffsetStepDetector
 from handtouch.supervisor.diagnose.static_load import StaticLoadDetector
 from handtouch.wire.faults import FaultKind
 
@@ -65,6 +67,7 @@ class HandDiagnostics:
         n = len(model.links)
         noise = np.hypot(model.noise_counts, 12**-0.5)
         self._channels = ChannelFaultDetector(model)
+        self._offset_steps = OffsetStepDetector(model)
         self._loose = LooseElectrodeDetector(model)
         self._weights = [electrode_weights(network) for network in model.networks]
         self._static_loads = StaticLoadDetector(noise, self._weights)
@@ -95,6 +98,7 @@ class HandDiagnostics:
         """Replace the stored offsets (c,) of a pad, with as many channels as it has."""
         self._offsets = self._offsets.copy()
         self._offsets[pad, : self._model.channel_counts[pad]] = offset_counts
+        self._offset_steps.reset(pad)
         self._static_loads.reset_zero(np.arange(len(self._model.links)) == pad)
 
     def reset_contacts(self, pad: int) -> None:
@@ -112,15 +116,36 @@ class HandDiagnostics:
         sample_ns = int(features.last_sample_ns.max())
         self._channels.process_block(features)
         faulty = self._channels.faulty_channels
-        counts = features.mean_counts
         healthy: BoolArray = np.asarray(np.logical_not(faulty.any(axis=1)))
-        self._static_loads.process_block(
-            sample_ns, counts, np.repeat(healthy[:, None], counts.shape[2], axis=1).astype(np.float64)
-        )
-        self._loose.process_block(block, self._offsets + self._static_loads.zero_counts, healthy)
+        usable = self._channels.usable_channels
+        counts = self._subtract_offsets(block, features.mean_counts, usable)
+        self._static_loads.process_block(sample_ns, counts, usable.astype(np.float64))
+        self._offset_steps_of_loads()
+        zero = self._offsets + self._static_loads.zero_counts + self._offset_steps.counts
+        self._loose.process_block(block, zero, healthy)
         healthy[list(self._loose.loose)] = False
         self._process_contacts(features, counts, healthy)
         return self._update_diagnoses(self._collect_diagnoses(), sample_ns)
+
+    def _subtract_offsets(self, block: HandSamples, counts: FloatArray, usable: BoolArray) -> FloatArray:
+        """Update the steps of offsets; return the short means (g, n, c) without them."""
+        static, steps = self._static_loads, self._offset_steps
+        for pad in np.flatnonzero(steps.end_steps(counts - static.zero_counts)).tolist():
+            static.forget(pad)
+        floor = static.floor_counts + static.zero_counts + steps.counts
+        steps.find_jumps(block, floor, usable)
+        for pad, channel, since_ns, size in steps.confirm(int(block.sample_ns.max()), floor):
+            steps.add_step(pad, channel, since_ns, size, None)
+            static.subtract(pad, channel, since_ns, size)
+        return counts - steps.counts
+
+    def _offset_steps_of_loads(self) -> None:
+        """Subtract the offsets among static loads, so that what comes later is seen as without them."""
+        for pad, load in list(self._static_loads.loads.items()):
+            if load.kind == FaultKind.OFFSET:
+                size = float(load.level_counts[load.channel])
+                self._offset_steps.add_step(pad, load.channel, load.since_ns, size, load)
+                self._static_loads.subtract(pad, load.channel, load.since_ns, size)
 
     def _process_contacts(self, features: BlockFeatures, counts: FloatArray, healthy: BoolArray) -> None:
         """Pass new contacts to their detectors: the highest short mean of each, less the static load."""
@@ -179,12 +204,13 @@ class HandDiagnostics:
             faults = {channel: f for (row, channel), f in self._channels.faults.items() if row == pad}
             for diagnosis in describe_channel_faults(self._model, pad, faults):
                 active[pad, diagnosis.kind] = diagnosis
-        for pad, load in self._static_loads.loads.items():
-            if pad not in faulty and load.kind is not None:
+        loads = [(pad, step.load) for (pad, _), step in self._offset_steps.steps.items()]
+        for pad, load in (*loads, *self._static_loads.loads.items()):
+            if load.kind is not None:
                 before = self._diagnoses.get((pad, load.kind))
                 names = named_electrodes(self._model, pad, load)
                 if before is None or before.electrodes != names:  # locating a load is expensive
-                    before = describe_static_load(self._model, pad, load)
+                    before = describe_static_load(self._model, pad, load, is_located=pad not in faulty)
                 active[pad, load.kind] = before
         for pad, detector in self._contact_detectors.items():
             fault = detector.fault

@@ -70,6 +70,8 @@ _MIN_PRESS_COUNTS, _MIN_PRESS_AWAY, _MAX_FLOOR_MOVE = 100.0, 0.12, 0.06
 """A press elsewhere: counts above the load, its distance from it, and the load's change of position."""
 _AFTER_PRESS_NS = 1_500_000_000
 """Time after a press in which the sheet relaxes too fast for the search of tremor."""
+_SAME_BEGIN_NS = 1_000_000_000
+"""From the begin of a load to a step that explains it."""
 _BEGIN_COUNTS = 250.0
 _MIN_SCATTER_BLOCKS = 6
 _NOISE_GAIN = 0.05  # of a block without a load
@@ -125,6 +127,7 @@ class StaticLoadDetector:
         self._touched = np.zeros(n, dtype=np.bool_)
         self._contacts = np.zeros(n, dtype=np.int64)  # begun
         self._last_ns = -1
+        self._valid = np.ones((n, c))
 
     def process_block(self, sample_ns: int, counts: FloatArray, valid: FloatArray) -> None:
         """Update floors and loads by the short means (g, n, c) of a block that ended at sample_ns.
@@ -132,6 +135,7 @@ class StaticLoadDetector:
         counts: relative to the stored offsets. valid: (n, c), 0 for channels with a known fault, which are
         ignored.
         """
+        self._leave_out(valid)
         counts = (counts - self._zero) * valid
         size = np.abs(counts).sum(axis=2)
         least = size.argmin(axis=0)
@@ -183,6 +187,56 @@ class StaticLoadDetector:
     def reset_zero(self, pads: FloatArray) -> None:
         """Reset the zero of some pads, (n,) bool, to their stored offsets."""
         self._zero[pads.astype(bool)] = 0.0
+
+    def forget(self, pad: int) -> None:
+        """Discard the load of a pad, whose zero has changed."""
+        self.loads.pop(pad, None)
+        for _, floor, total in self._recent_floors:
+            floor[pad] = total[pad] = 0.0
+
+    def subtract(self, pad: int, channel: int, since_ns: int, counts: float) -> None:
+        """Subtract a step of one channel, known since a time, from what is remembered of a pad."""
+        step = np.zeros(self._zero.shape[1])
+        step[channel] = counts
+        for at, floor, total in self._recent_floors:
+            if at > since_ns:
+                floor[pad] -= step
+                total[pad] = np.abs(floor[pad]).sum()
+            if total[pad] <= MIN_LOAD_COUNTS:
+                self._last_unloaded_ns[pad] = max(self._last_unloaded_ns[pad], at)
+        load = self.loads.get(pad)
+        if load is None:
+            return
+        own = step[: self._channels(pad)]
+        for number, (age_s, floor) in enumerate(zip(load.ages_s, load.floors_counts, strict=True)):
+            if load.since_ns + age_s * 1e9 > since_ns:
+                load.floors_counts[number] = floor[: len(own)] - own
+        load.level_counts = load.level_counts - own
+        if load.since_ns >= since_ns - _SAME_BEGIN_NS:  # that was the load, if nothing is left of it
+            del self.loads[pad]
+        elif np.isfinite(load.early_counts) and load.since_ns + 3_000_000_000 > since_ns:
+            load.early_counts = float(np.abs(load.level_counts).sum())
+
+    def _leave_out(self, valid: FloatArray) -> None:
+        """Leave channels that became faulty out of what is remembered of their pads."""
+        changed = (valid != self._valid).any(axis=1)
+        self._valid = valid.copy()
+        for pad in np.flatnonzero(changed).tolist():
+            for _, floor, total in self._recent_floors:
+                floor[pad] *= valid[pad]
+                total[pad] = np.abs(floor[pad]).sum()
+            load = self.loads.get(pad)
+            if load is None:
+                continue
+            own = valid[pad, : self._channels(pad)]
+            whole = max(float(np.abs(load.level_counts).sum()), 1e-9)
+            load.level_counts = load.level_counts * own
+            part = float(np.abs(load.level_counts).sum()) / whole
+            load.peak_counts, load.early_counts = part * load.peak_counts, part * load.early_counts
+            load.later_counts *= part
+            for number, floor in enumerate(load.floors_counts):
+                load.floors_counts[number] = floor[: len(own)] * own
+            load.scatter.clear()
 
     def _track_load(self, pad: int, sample_ns: int, floor: FloatArray, total: float) -> None:
         load = self.loads.get(pad)
