@@ -65,6 +65,13 @@ export interface Contact extends Envelope {
     covariance_m2: number[];
     force_n: number | null;
     force_std_n: number | null;
+    /** absent unless the contact's own status in that frame is valid */
+    palm_position_m?: number[];
+    palm_normal?: number[];
+    palm_covariance_m2?: number[];
+    base_position_m?: number[];
+    base_normal?: number[];
+    base_covariance_m2?: number[];
   }[];
   /** false while samples are missing: values of the last sample; absent where true */
   fresh?: boolean;

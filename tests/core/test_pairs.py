@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -201,3 +202,34 @@ def test_two_contacts_are_the_same_after_their_state_was_saved_and_loaded(
     assert sinks[1].payloads
     assert sinks[0].payloads == sinks[1].payloads
     assert whole.state.parts.tobytes() == again.state.parts.tobytes()
+
+
+def test_the_two_contacts_have_palm_and_base_positions_where_their_contact_has(
+    model: PadModel, presses: tuple[VirtualHand, NDArray[np.int64]]
+) -> None:
+    pipeline = pipeline_of(model, Collector())
+    play(pipeline, presses[1][:152], 0)
+    held = pipeline.state
+    held.palm_requested[PAD] = held.base_requested[PAD] = True
+    held.palm_status[PAD], held.base_status[PAD] = wire.FrameStatus.VALID, wire.FrameStatus.STALE
+    held.palm_values[PAD], held.part_frames[PAD] = np.arange(31.0), np.arange(100.0, 160.0)
+    contact = published_contact(pipeline)
+    for number, part in enumerate(contact.parts):
+        first = 100.0 + 30.0 * number
+        assert part["palm_position_m"] == [first, first + 1, first + 2]
+        assert part["palm_normal"] == [first + 3, first + 4, first + 5]
+        assert part["palm_covariance_m2"] == [first + 6 + k for k in range(9)]
+        assert not [key for key in part if key.startswith("base")]
+    held.base_status[PAD] = wire.FrameStatus.VALID
+    contact = published_contact(pipeline)
+    assert contact.parts[1]["base_normal"] == [148.0, 149.0, 150.0]
+    assert set(contact.parts[0]) == {field.name for field in fields(wire.ContactPart)}
+
+
+def published_contact(pipeline: Pipeline) -> wire.Contact:
+    """Return the contact that a late subscriber gets."""
+    message = pipeline.messages.retained_messages()["contact/finger/middle"](10**10)
+    assert message is not None
+    contact = wire.decode(wire.encode(message))
+    assert isinstance(contact, wire.Contact)
+    return contact

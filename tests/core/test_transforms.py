@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
+from handtouch.core.contact_solver import PART_COUNT
 from handtouch.core.link_poses import LinkPose, LinkPoses
 from handtouch.core.state import TickState
 from handtouch.core.tick import PadColumns, TickResult
@@ -349,3 +350,33 @@ def test_used_joints_are_recorded_and_replayed() -> None:
     replayed.transforms.replay_joints(frames.recorded_joints())
     assert replayed.step().contact_fields(TIP) == frames.contact_fields(TIP)
     assert replayed.transforms.recorded_joints() == frames.recorded_joints()
+
+
+def test_two_contacts_on_a_pad_are_transformed_as_its_contact_is() -> None:
+    """With the joints' and the mounts' uncertainty; absent again with the contact's next sample."""
+    robots = RobotModels(DEPLOYMENT)
+    touched = TouchedHand(TIP, HEEL, joints=joint_states(100, 0.4, 0.01), robots=robots)
+    state, columns = touched.transforms.state, touched.columns
+    contacts = [
+        np.concatenate([columns.position_m[pad], columns.normal[pad], columns.covariance_m2[pad].ravel()])
+        for pad in (TIP, HEEL)
+    ]
+    parts = state.parts.reshape(len(PADS), 2, PART_COUNT)
+    parts[TIP, :, :15] = contacts[::-1]
+    frames = touched.step()
+    moved = state.part_frames.reshape(len(PADS), 2, 2, 15)
+    own = frames.contact_fields(TIP)
+    for number, name in enumerate(("palm", "base")):
+        expected = [
+            value for key in ("position_m", "normal", "covariance_m2") for value in own[f"{name}_{key}"]
+        ]
+        np.testing.assert_allclose(moved[TIP, 1, number], expected, rtol=1e-12)
+        columns.position_m[TIP], columns.normal[TIP] = contacts[1][:3], contacts[1][3:6]
+        columns.covariance_m2[TIP] = contacts[1][6:].reshape(3, 3)
+    assert np.isnan(moved[HEEL]).all()
+    kept = moved[TIP, 0].copy()
+    parts[TIP] = np.nan
+    own = touched.step().contact_fields(TIP)  # the other one of the two is now the pad's contact
+    np.testing.assert_allclose(kept[0, :3], own["palm_position_m"], rtol=1e-12)
+    np.testing.assert_allclose(kept[1, 6:], own["base_covariance_m2"], rtol=1e-9, atol=1e-18)
+    assert np.isnan(moved[TIP]).all()

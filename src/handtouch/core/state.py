@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.memory import view_memory
-from handtouch.core.stages.frames import FRAME_VALUES
+from handtouch.core.stages.frames import FRAME_VALUES, PART_FRAMES
 from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import PARTS_COUNT, VALUE_COUNT
@@ -216,6 +216,8 @@ class TickState:
     """ForceStatus"""
     frame_force_vector: Annotated[FloatArray, Stored("<f8", _PADS, 6, fill=math.nan)]
     """force in the palm's frame, then in the base's"""
+    part_frames: Annotated[FloatArray, Stored("<f8", _PADS, PART_FRAMES, fill=math.nan)]
+    """of each of two contacts on a pad, `FRAME_SLICES` in the palm, then in the base"""
 
     # messages
     contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]

@@ -43,7 +43,7 @@ _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
 _MIN_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
 _PAD_TEXTS = 4  # the last is empty
-_MAX_VALUE_BYTES = 2048  # numbers and names of statuses
+_MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
 
 class MessageSink(Protocol):

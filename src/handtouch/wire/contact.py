@@ -46,6 +46,19 @@ class ContactPart:
     requests no forces, or there is only a lower bound"""
     force_std_n: float | None
     """standard deviation of `force_n`"""
+    palm_position_m: Vector3 | None = None
+    """in the palm's frame; this and the two that follow are absent unless the contact's `palm_status` is
+    `valid`"""
+    palm_normal: Vector3 | None = None
+    """outward unit normal, in the palm's frame"""
+    palm_covariance_m2: Matrix3 | None = None
+    """covariance of `palm_position_m`, row by row; includes the stated uncertainty of mounts and joints"""
+    base_position_m: Vector3 | None = None
+    """in the base's frame; absent, with the two that follow, unless `base_status` is `valid`"""
+    base_normal: Vector3 | None = None
+    """outward unit normal, in the base's frame"""
+    base_covariance_m2: Matrix3 | None = None
+    """covariance of `base_position_m`, row by row"""
 
 
 @dataclass(frozen=True, slots=True)

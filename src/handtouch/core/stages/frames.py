@@ -5,14 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 from handtouch.core.stages import kinematics
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import PART_COUNT, PART_SLICES, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
 
 FRAME_VALUES = 15
 FRAME_SLICES = {"position_m": slice(0, 3), "normal": slice(3, 6), "covariance_m2": slice(6, 15)}
 """Layout of a contact in one frame; a row of values holds it in palm, in base, and the age of joints."""
+PART_FRAMES = 4 * FRAME_VALUES
+"""Values of a row of `part_frames`: of each of two contacts on a pad, in palm and in base."""
 _COUNT, _ROW, _AGE = FRAME_VALUES, 2 * FRAME_VALUES + 1, 2 * FRAME_VALUES
 _VALUES, _POSITION = VALUE_COUNT, VALUE_SLICES["position_m"].start
 _NORMAL, _COVARIANCE = VALUE_SLICES["normal"].start, VALUE_SLICES["covariance_m2"].start
+_PART_COUNT, _PARTS_COUNT, _PART_FRAMES = PART_COUNT, PARTS_COUNT, PART_FRAMES
+_PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
+_PART_COVARIANCE = PART_SLICES["covariance_m2"].start
 _VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
 _NOT_COMPUTED, _VALID, _STALE, _INVALID = 0, 1, 2, 3  # FrameStatus
 _NAN, _INFINITY = float("nan"), float("inf")
@@ -69,6 +74,7 @@ class FrameStage:
         self.frame_values, self.rotation = arrays["palm_values"], arrays["palm_rotation"]
         self.joint_variance_m2 = arrays["joint_variance_m2"]
         self.vector, self.frame_vector = arrays["force_vector"], arrays["frame_force_vector"]
+        self.parts, self.part_frames = arrays["parts"], arrays["part_frames"]
         self.published, self.pending = published, pending
         self.pose, self.covariance = pose, covariance
 
@@ -131,6 +137,11 @@ def _discard(stage: FrameStage, pad: int) -> None:
         stage.frame_values[pad * _ROW + i] = _NAN
     for i in range(_FRAME_VECTORS):
         stage.frame_vector[pad * _FRAME_VECTORS + i] = _NAN
+    first = pad * _PART_FRAMES
+    in_palm, in_base = stage.part_frames[first], stage.part_frames[first + _COUNT]
+    if in_palm == in_palm or in_base == in_base:
+        for i in range(_PART_FRAMES):
+            stage.part_frames[first + i] = _NAN
     _publish_pad(stage, pad)
 
 
@@ -191,32 +202,88 @@ def _transform(
         stage.palm_status[pad] = status
     if status != _VALID:
         return oldest_s
-    _add_link_covariance(stage, hand, pad)
+    _write_in_frame(
+        stage,
+        hand,
+        link,
+        values,
+        on_pad + _POSITION,
+        on_pad + _NORMAL,
+        on_pad + _COVARIANCE,
+        stage.frame_values,
+        row,
+    )
     for i in range(3):
         a, b, c = pose[3 * i], pose[3 * i + 1], pose[3 * i + 2]
-        for j in range(2):
-            at = on_pad + (_NORMAL if j else _POSITION)
-            turned = a * values[at] + b * values[at + 1] + c * values[at + 2]
-            stage.frame_values[row + 3 * j + i] = turned if j else turned + pose[9 + i]
         at = _VECTOR * pad
         turned = a * stage.vector[at] + b * stage.vector[at + 1] + c * stage.vector[at + 2]
         stage.frame_vector[_FRAME_VECTORS * pad + (3 if in_base else 0) + i] = turned
-    for i in range(9):
-        stage.frame_values[row + 6 + i] = stage.covariance[i]
+    if stage.parts[pad * _PARTS_COUNT] == stage.parts[pad * _PARTS_COUNT]:
+        _transform_parts(stage, hand, pad, in_base)
     return oldest_s
 
 
-def _add_link_covariance(stage: FrameStage, hand: HandFrames, pad: int) -> None:
+def _transform_parts(stage: FrameStage, hand: HandFrames, pad: int, in_base: bool) -> None:
+    """Transform two contacts on a pad to the frame of `pose`."""
+    link = pad - hand.first
+    for k in range(2):
+        at = pad * _PARTS_COUNT + k * _PART_COUNT
+        for i in range(9):
+            stage.covariance[i] = 0.0
+        hand.tree.add_joint_covariance(
+            link, in_base, stage.parts, at + _PART_POSITION, hand.used_stds, stage.covariance
+        )
+        _write_in_frame(
+            stage,
+            hand,
+            link,
+            stage.parts,
+            at + _PART_POSITION,
+            at + _PART_NORMAL,
+            at + _PART_COVARIANCE,
+            stage.part_frames,
+            pad * _PART_FRAMES + (2 * k + (1 if in_base else 0)) * _COUNT,
+        )
+
+
+def _write_in_frame(
+    stage: FrameStage,
+    hand: HandFrames,
+    link: int,
+    values: memoryview[float],
+    position: int,
+    normal: int,
+    covariance: int,
+    written: memoryview[float],
+    row: int,
+) -> None:
+    """Write position, normal and covariance in the frame of `pose` to `written`, from index `row` on.
+
+    They are at these indices of `values`, in the link's frame; `covariance` of the stage is that by joints.
+    """
+    pose = stage.pose
+    _add_link_covariance(stage, hand, link, values, position, covariance)
+    for i in range(3):
+        a, b, c = pose[3 * i], pose[3 * i + 1], pose[3 * i + 2]
+        turned = a * values[position] + b * values[position + 1] + c * values[position + 2]
+        written[row + i] = turned + pose[9 + i]
+        written[row + 3 + i] = a * values[normal] + b * values[normal + 1] + c * values[normal + 2]
+    for i in range(9):
+        written[row + 6 + i] = stage.covariance[i]
+
+
+def _add_link_covariance(
+    stage: FrameStage, hand: HandFrames, link: int, values: memoryview[float], position: int, first: int
+) -> None:
     """Add the covariance of the contact on its link, and of the pad's mount, turned to the frame of `pose`.
 
     A rotation error of s about each axis through the pad's origin moves a point at r by s^2 (r.r 1 - r r').
     """
-    pose, values, mount = stage.pose, stage.values, 3 * (pad - hand.first)
-    first, at = pad * _VALUES + _COVARIANCE, pad * _VALUES + _POSITION
+    pose, mount = stage.pose, 3 * link
     x, y, z = (
-        values[at] - hand.mounts[mount],
-        values[at + 1] - hand.mounts[mount + 1],
-        values[at + 2] - hand.mounts[mount + 2],
+        values[position] - hand.mounts[mount],
+        values[position + 1] - hand.mounts[mount + 1],
+        values[position + 2] - hand.mounts[mount + 2],
     )
     turning = hand.mount_rotation_variance
     even = hand.mount_variance + turning * (x * x + y * y + z * z)

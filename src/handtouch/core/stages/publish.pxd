@@ -5,7 +5,7 @@ cdef Py_ssize_t _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_
 cdef Py_ssize_t _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID, _EVIDENCE_MISSING
 cdef Py_ssize_t _PALM_VALUES, _PAD_M, _NORMAL, _COVARIANCE, _RESIDUAL, _RESIDUAL_STD, _BASE, _AGE, _END
 cdef Py_ssize_t _EVENTS, _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS, _REQUIRED
-cdef Py_ssize_t _HEADER_BYTES, _PAD_TEXTS, _FRAME_VALID, _VECTOR, _FRAME_VECTORS
+cdef Py_ssize_t _HEADER_BYTES, _PAD_TEXTS, _FRAME_VALID, _VECTOR, _FRAME_VECTORS, _PART_FRAMES, _KEY_PALM, _KEY_BASE
 cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT, _PART_COVARIANCE, _PART_FORCE, _KEY_POSITION, _KEY_NORMAL
 cdef Py_ssize_t _KEY_COVARIANCE, _KEY_FORCE, _KEY_FORCE_STD, _KEY_PARTS
 cdef long long _MAX_SILENT_PERIODS
@@ -41,7 +41,7 @@ cdef class ContactEncoder:
     cdef long long[::1] max_sample_period_ns
     cdef double[::1] number, values, palm_values, peak_force_n, total_current_a, uncompensated_force_n
     cdef unsigned char[::1] vector_status
-    cdef double[::1] vector, frame_vector, parts
+    cdef double[::1] vector, frame_vector, parts, part_frames
     cdef Py_ssize_t written, field, fields
     @cython.locals(sample_ns='long long', begin_ns='long long', t_ns='long long', first=Py_ssize_t,
                    status=Py_ssize_t, located=bint, has_std=bint, max_silent_ns='long long')
@@ -52,8 +52,10 @@ cdef class ContactEncoder:
 @cython.locals(first=Py_ssize_t)
 cdef void _write_frames(ContactEncoder encoder, Py_ssize_t pad) noexcept
 cdef void _write_frame(ContactEncoder encoder, Py_ssize_t status, Py_ssize_t first) noexcept
-@cython.locals(k=Py_ssize_t, at=Py_ssize_t)
-cdef void _write_parts(ContactEncoder encoder, Py_ssize_t first) noexcept
+@cython.locals(k=Py_ssize_t, at=Py_ssize_t, first=Py_ssize_t, in_palm=bint, in_base=bint, has_palm=bint,
+               has_base=bint)
+cdef void _write_parts(ContactEncoder encoder, Py_ssize_t pad) noexcept
+cdef void _write_frame_values(ContactEncoder encoder, Py_ssize_t at) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _write_text(ContactEncoder encoder, Py_ssize_t begin, Py_ssize_t end) noexcept
 cdef void _write_key(ContactEncoder encoder) noexcept

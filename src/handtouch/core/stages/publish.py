@@ -55,9 +55,11 @@ _VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and
 _END = 2  # number of the event
 _PART_COUNT, _PARTS_COUNT, _PART_COVARIANCE = PART_COUNT, PARTS_COUNT, PART_SLICES["covariance_m2"].start
 _PART_FORCE = PART_SLICES["force_n"].start
+_PART_FRAMES = 60  # two contacts in palm and base, `frames.PART_FRAMES`
 _KEY_POSITION, _KEY_NORMAL = WRITTEN_FIELDS.index("position_m"), WRITTEN_FIELDS.index("normal")
 _KEY_COVARIANCE, _KEY_FORCE = WRITTEN_FIELDS.index("covariance_m2"), WRITTEN_FIELDS.index("force_n")
 _KEY_FORCE_STD, _KEY_PARTS = WRITTEN_FIELDS.index("force_std_n"), WRITTEN_FIELDS.index("parts")
+_KEY_PALM, _KEY_BASE = WRITTEN_FIELDS.index("palm_position_m"), WRITTEN_FIELDS.index("base_position_m")
 _EVENTS = len(WRITTEN_FIELDS)  # first of the names of events, statuses and reasons
 _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS = (
     _EVENTS + 3,
@@ -214,6 +216,7 @@ class ContactEncoder:
         self.palm_values, self.group_id = arrays["palm_values"], arrays["group_id"]
         self.vector, self.vector_status = arrays["force_vector"], arrays["force_vector_status"]
         self.frame_vector, self.parts = arrays["frame_force_vector"], arrays["parts"]
+        self.part_frames = arrays["part_frames"]
         self.pad_texts, self.pad_text_ends = pad_texts, pad_text_ends
         self.written = self.field = self.fields = 0
 
@@ -280,7 +283,7 @@ class ContactEncoder:
             _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad + 3, 3)
         if self.parts[_PARTS_COUNT * pad] == self.parts[_PARTS_COUNT * pad]:
             self.fields += 1
-            _write_parts(self, _PARTS_COUNT * pad)
+            _write_parts(self, pad)
         self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.fields
         return self.written
 
@@ -316,14 +319,18 @@ def _write_frame(encoder: ContactEncoder, status: int, first: int) -> None:
     _write_optional_array(encoder, encoder.palm_values, first + 6, 9)
 
 
-def _write_parts(encoder: ContactEncoder, first: int) -> None:
-    """Write two contacts as maps, from index `first` on."""
+def _write_parts(encoder: ContactEncoder, pad: int) -> None:
+    """Write the two contacts of a pad as maps."""
+    in_palm, in_base = encoder.palm_status[pad] == _FRAME_VALID, encoder.base_status[pad] == _FRAME_VALID
     encoder.field = _KEY_PARTS
     _write_key(encoder)
     _write_byte(encoder, 0x92)
     for k in range(2):
-        at = first + k * _PART_COUNT
-        _write_byte(encoder, 0x85)
+        at = pad * _PARTS_COUNT + k * _PART_COUNT
+        first = pad * _PART_FRAMES + 2 * k * _BASE
+        has_palm = in_palm and _are_finite(encoder.part_frames, first, 1)
+        has_base = in_base and _are_finite(encoder.part_frames, first + _BASE, 1)
+        _write_byte(encoder, 0x85 + (3 if has_palm else 0) + (3 if has_base else 0))
         encoder.field = _KEY_POSITION
         _write_array(encoder, encoder.parts, at, 3, True)
         encoder.field = _KEY_NORMAL
@@ -334,6 +341,19 @@ def _write_parts(encoder: ContactEncoder, first: int) -> None:
         _write_number(encoder, encoder.parts[at + _PART_FORCE])
         encoder.field = _KEY_FORCE_STD
         _write_number(encoder, encoder.parts[at + _PART_FORCE + 1])
+        if has_palm:
+            encoder.field = _KEY_PALM
+            _write_frame_values(encoder, first)
+        if has_base:
+            encoder.field = _KEY_BASE
+            _write_frame_values(encoder, first + _BASE)
+
+
+def _write_frame_values(encoder: ContactEncoder, at: int) -> None:
+    """Write position, normal and covariance of one of two contacts in palm or base."""
+    _write_array(encoder, encoder.part_frames, at, 3, True)
+    _write_array(encoder, encoder.part_frames, at + 3, 3, True)
+    _write_array(encoder, encoder.part_frames, at + 6, 9, True)
 
 
 def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:
