@@ -24,7 +24,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, matches, play_case
+from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, hides, matches, play_case
 from scores import Share, score_events
 
 from handtouch.wire.faults import FaultKind
@@ -99,6 +99,14 @@ def row(episodes: Sequence[Episode], **names: str) -> dict[str, Any]:
         "unexplained, %": str(Share.of_mask(np.array(unexplained))),
         "false alarms": ", ".join(f"{kind} {count}" for kind, count in wrong.most_common(4)),
     }
+
+
+def pair_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
+    """Return a row of the pairs of faults that are observable side by side, and of the others."""
+    some = of_case(episodes, "two faults on one pad")
+    kinds = {"each observable beside the other": False, "one hides the other": True}
+    split = {label: [it for it in some if hides(it["events"]) == hidden] for label, hidden in kinds.items()}
+    return [row(part, pairs=label) for label, part in split.items() if part]
 
 
 def gum_rows(episodes: Sequence[Episode]) -> list[dict[str, Any]]:
@@ -237,6 +245,9 @@ other."""
 NOTES = {
     "By case": "Recall, precision and false alarms as in [diagnose](diagnose.md), with 95 % intervals "
     "(Clopper and Pearson, Poisson); an event is a fault.",
+    "Two faults on one pad": "A contact has three unknowns and four currents. Faults that show in contacts need "
+    "all channels: one that is stuck, saturated, shorted or dead hides swapped cables, gains, torn corners and "
+    "dead electrodes. The current of a short to the layer hides gum, moisture and offsets.",
     "Gum on S1 and S2": "Error: from `pad_m` at its first diagnosis to the middle of the gum.",
     "Healthy pads touched along a centre line": "Presses and slow strokes along one line midway between "
     "opposite electrodes of pads with series resistors. Both read the same there, which is no evidence that "
@@ -259,6 +270,7 @@ def main() -> None:
     episodes = play_all(asked.workers, asked.journal, 0.0 if asked.quick else asked.share)
     tables = {
         "By case": [row(of_case(episodes, case.name), case=case.name) for case in CASES],
+        "Two faults on one pad": pair_rows(episodes),
         "Gum on S1 and S2": gum_rows(episodes),
         "Healthy pads touched along a centre line": shorted_rows(episodes),
         "Mended faults": end_rows(episodes),

@@ -1,6 +1,6 @@
 """Cases for bench_diagnose_cases: pads, sheets and faults beyond the episodes of bench_diagnose.
 
-Public names: `Case`, `CASES`, `HAND_EPISODES`, `play_case`, `matches`.
+Public names: `Case`, `CASES`, `HAND_EPISODES`, `play_case`, `matches`, `hides`.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ CASES = (
     Case("moisture", _DEFAULT, ("moisture",), 24),
     Case("loose electrode", _DEFAULT, ("loose electrode",), 24),
     Case("two faults on two pads", _DEFAULT, ("two pads",), 24),
-    Case("two faults on one pad", _DEFAULT, ("one pad",), 24),
+    Case("two faults on one pad", _DEFAULT, ("one pad",), 96),
     Case("drift of `harsh`", _DRIFTING, PLAYED, 4),
     Case("drift of `harsh`, no fault", _DRIFTING, ("plain use",), 24),
     Case("series resistors", _DEFAULT, (*PLAYED, "shorted pair"), 4, with_resistors),
@@ -127,6 +127,23 @@ def _draw_faults(
             keys["until_s"] = begin_s + MENDED_S
         drawn.append((one, keys))
     return drawn
+
+
+def hides(events: list[dict[str, Any]]) -> bool:
+    """Return whether one of two faults of a pad leaves too few currents to observe the other.
+
+    Four currents and three unknowns of a contact: faults that show in contacts need all channels. Of a pad
+    that is shorted to the layer, all channels carry the current of the short.
+    """
+    first, second = (event["name"] for event in events)
+    pairs = ((first, second), (second, first))
+    lost = ("stuck channel", "saturated channel", "shorted electrode", "dead electrode")
+    shown = ("swapped cables", "torn corner", "gain step", "dead electrode")
+    static = ("gum", "moisture", "offset")
+    return any(
+        (one in lost and other in shown) or (one == "shorted electrode" and other in static)
+        for one, other in pairs
+    )
 
 
 def _right_kind(name: str) -> FaultKind:

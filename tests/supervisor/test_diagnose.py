@@ -344,6 +344,24 @@ def test_electrode_that_opens_and_closes_is_a_dead_electrode_part_of_the_time() 
     assert not found.published.position_valid
 
 
+def test_electrode_that_opens_under_a_contact_and_stays_open_is_dead() -> None:
+    """Also where contacts would be those of a healthy pad: far from it."""
+    network = model().networks[0]
+    broken = network.with_series_ohm([0, np.inf, 0, 0])
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        if t % 1.0 > 0.5:
+            return np.zeros(4)
+        x, y = np.random.default_rng(int(t)).uniform(0.1, 0.5 if t > 11 else 0.9, 2)
+        pad = broken if t > 10.2 else network
+        return np.asarray(pad.fractions(x * network.a, y * network.b) * 3000)
+
+    _, changes = play(contacts, 20)
+    (found,) = changes
+    assert (found.kind, found.electrodes) == (FaultKind.DEAD_ELECTRODE, ("xa",))
+    assert "carries no current" in found.published.cause
+
+
 def test_loose_electrode_isnt_left_out_of_the_location_of_contacts() -> None:
     """Its contacts would be located wrongly while it is connected."""
     diagnosis, _ = play(lambda t, _: loose(t), 15)

@@ -213,16 +213,23 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
 
 
 def describe_loose_electrode(model: DiagnosisModel, pad: int, loose: LooseElectrode) -> PadDiagnosis:
-    """Return the diagnosis of an electrode that opens and closes: `dead_electrode`, part of the time."""
+    """Return the diagnosis of an electrode that opened: `dead_electrode`, always or part of the time."""
     name, values = model.electrodes[pad][loose.channel], loose.evidence
-    cause = (
-        f"electrode {name} is open part of the time: under contacts, its current stops and returns from one "
-        "sample to the next, and the other electrodes take it over"
-    )
-    remedy = (
-        "move the cable while the pad is pressed to find the loose contact: wire, crimp, socket, or the glue "
-        "between electrode and sheet"
-    )
+    is_located = loose.is_dead and len(model.electrodes[pad]) >= _MIN_CHANNELS_WITH_DEAD
+    if loose.is_dead:
+        values["contacts"] = float(loose.contacts)
+        cause = f"electrode {name} carries no current: its wire is broken or unplugged"
+        remedy = "check the wire and the socket of that electrode"
+        remedy += "; until then, contacts are located with the others" if is_located else ""
+    else:
+        cause = (
+            f"electrode {name} is open part of the time: under contacts, its current stops and returns from "
+            "one sample to the next, and the other electrodes take it over"
+        )
+        remedy = (
+            "move the cable while the pad is pressed to find the loose contact: wire, crimp, socket, or the "
+            "glue between electrode and sheet"
+        )
     published = Diagnosis(
         FaultKind.DEAD_ELECTRODE,
         cause,
@@ -230,8 +237,8 @@ def describe_loose_electrode(model: DiagnosisModel, pad: int, loose: LooseElectr
         remedy,
         loose.since_ns,
         loose.confidence,
-        position_valid=False,
-        force_valid=False,
+        position_valid=is_located,
+        force_valid=is_located,
     )
     return PadDiagnosis(published, model.links[pad], values, (name,))
 

@@ -245,5 +245,10 @@ def _is_sliding(excess: FloatArray, at: int, position: FloatArray, weights: Floa
 
 
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:
+    if (before.kind, before.published.cause) != (
+        now.kind,
+        now.published.cause,
+    ) and now.kind == FaultKind.DEAD_ELECTRODE:
+        return True  # dead now, or part of the time only
     change = abs(now.published.confidence - before.published.confidence)
     return before.electrodes != now.electrodes or change > _MIN_CONFIDENCE_CHANGE

@@ -24,6 +24,8 @@ from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, Hand
 
 MIN_STEPS = 3
 """Openings and closings of an electrode, at least one of each, within `MAX_AGE_NS`."""
+MIN_OPEN_CONTACTS = 6
+"""Contacts without a current of an electrode that opened, after which it is dead."""
 MAX_AGE_NS = 60_000_000_000
 END_TOUCHED_NS = 30_000_000_000
 """Time of contact without an opening or closing, after which the electrode isn't loose any more."""
@@ -41,6 +43,10 @@ _MIN_MISFIT_RATIO = 2.5
 _DEAD_TIME_NS = 50_000_000
 """From one step of an electrode to the next."""
 _TOUCHED_COUNTS = 250.0
+_STEPS_OF_DEAD = 2
+"""Steps that count as much as the contacts after the opening of a dead electrode."""
+_MIN_RETURNED_COUNTS, _MIN_RETURNED_FRACTION = 100.0, 0.05
+"""Of a channel that isn't open any more, also of the total."""
 _WRONG_PER_STEP = 0.2
 """Probability that one step isn't an opening or closing, for the stated confidence."""
 
@@ -55,11 +61,21 @@ class LooseElectrode:
     touched_ns: int = 0
     """time of contact since the last step"""
     is_reported: bool = False
+    contacts: int = 0
+    """contacts that began since the last step"""
+    was_touched: bool = True
+    is_open: bool = False
+    """since the last step"""
+
+    @property
+    def is_dead(self) -> bool:
+        """Return whether it stays open."""
+        return self.is_open and self.contacts >= MIN_OPEN_CONTACTS
 
     @property
     def confidence(self) -> float:
         """Probability that the electrode is loose, by the number of its steps."""
-        return 1.0 - _WRONG_PER_STEP ** len(self.steps)
+        return 1.0 - _WRONG_PER_STEP ** (len(self.steps) + (_STEPS_OF_DEAD if self.is_dead else 0))
 
     @property
     def evidence(self) -> dict[str, float]:
@@ -83,7 +99,9 @@ class LooseElectrodeDetector:
         """Loose electrodes by the row of the pad: the one with most steps."""
         found: dict[int, LooseElectrode] = {}
         for (pad, _), one in self._candidates.items():
-            if one.is_reported and (pad not in found or len(one.steps) > len(found[pad].steps)):
+            if (one.is_reported or one.is_dead) and (
+                pad not in found or len(one.steps) > len(found[pad].steps)
+            ):
                 found[pad] = one
         return found
 
@@ -97,7 +115,7 @@ class LooseElectrodeDetector:
             )
         keep = slice(-_LAGS[-1], None)
         self._last = stamps[keep], counts[keep], fresh[keep]
-        self._age(stamps, counts)
+        self._age(block.sample_ns, block.counts - zero_counts)
         for lag in _LAGS:
             if len(counts) > lag:
                 usable = fresh[:-lag] & fresh[lag:] & healthy
@@ -162,19 +180,23 @@ class LooseElectrodeDetector:
         if one.steps and abs(at_ns - one.steps[-1][0]) < _DEAD_TIME_NS:
             return
         one.steps.append((at_ns, opened))
-        one.touched_ns = 0
+        one.touched_ns = one.contacts = 0
+        one.was_touched, one.is_open = True, opened
         recent = [was_opened for since, was_opened in one.steps if since > at_ns - MAX_AGE_NS]
         if not one.is_reported:
             one.since_ns = next(since for since, _ in one.steps if since > at_ns - MAX_AGE_NS)
             one.is_reported = len(recent) >= MIN_STEPS and any(recent) and not all(recent)
 
     def _age(self, stamps: NDArray[np.int64], counts: FloatArray) -> None:
-        """End the loose electrodes whose pads were touched for long without a step."""
-        if len(stamps) < 2:
-            return
+        """Count contacts; end the loose electrodes of pads that were touched for long without a step."""
         for pad, channel in list(self._candidates):
-            touched = float(np.mean(counts[:, pad].sum(axis=1) > _TOUCHED_COUNTS))
+            totals, reading = counts[:, pad].sum(axis=1), counts[:, pad, channel]
+            touched = totals > _TOUCHED_COUNTS
             one = self._candidates[pad, channel]
-            one.touched_ns += int(touched * (stamps[-1, pad] - stamps[0, pad]))
-            if one.touched_ns > END_TOUCHED_NS:
+            one.contacts += int((touched & ~np.append(one.was_touched, touched[:-1])).sum())
+            one.was_touched = bool(touched[-1])
+            one.touched_ns += int(touched.mean() * (stamps[-1, pad] - stamps[0, pad]))
+            returned = reading > np.maximum(_MIN_RETURNED_COUNTS, _MIN_RETURNED_FRACTION * totals)
+            one.is_open &= not returned.any()  # it may close while nothing touches the pad
+            if one.touched_ns > END_TOUCHED_NS and not one.is_dead:
                 del self._candidates[pad, channel]
