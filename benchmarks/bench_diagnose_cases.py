@@ -245,9 +245,9 @@ other."""
 NOTES = {
     "By case": "Recall, precision and false alarms as in [diagnose](diagnose.md), with 95 % intervals "
     "(Clopper and Pearson, Poisson); an event is a fault.",
-    "Two faults on one pad": "A contact has three unknowns and four currents. Faults that show in contacts need "
-    "all channels: one that is stuck, saturated, shorted or dead hides swapped cables, gains, torn corners and "
-    "dead electrodes. The current of a short to the layer hides gum, moisture and offsets.",
+    "Two faults on one pad": "A contact has three unknowns and four currents. Faults that show in contacts "
+    "need all channels: one that is stuck, saturated, shorted or dead hides swapped cables, gains, torn "
+    "corners and dead electrodes. The current of a short to the layer hides gum, moisture and offsets.",
     "Gum on S1 and S2": "Error: from `pad_m` at its first diagnosis to the middle of the gum.",
     "Healthy pads touched along a centre line": "Presses and slow strokes along one line midway between "
     "opposite electrodes of pads with series resistors. Both read the same there, which is no evidence that "
