@@ -12,7 +12,7 @@ import pytest
 from handtouch.cli import main
 from handtouch.record import plot
 from handtouch.record.recording import Recording
-from handtouch.record.tables import component_names
+from handtouch.record.tables import component_names, flatten_payload
 
 pyarrow = pytest.importorskip("pyarrow")
 
@@ -48,6 +48,18 @@ def test_every_contact_message_is_a_row_with_its_values(recorded: Path, tables: 
         assert float(row["force_n"]) == payload["force_n"]
         position = [float(row[f"position_{axis}_m"]) for axis in "xyz"]
         assert position == payload["position_m"]
+
+
+def test_two_contacts_of_a_pad_have_columns_that_are_empty_for_one() -> None:
+    part = {"position_m": [1.0, 2.0, 3.0], "covariance_m2": list(range(9)), "force_n": 0.5}
+    row = flatten_payload({"link": "tip", "parts": [part, part | {"palm_position_m": [4.0, 5.0, 6.0]}]})
+    assert [row[f"part_2_position_{axis}_m"] for axis in "xyz"] == [1.0, 2.0, 3.0]
+    assert (row["part_1_force_n"], row["part_1_force_std_n"]) == (0.5, None)
+    assert row["part_1_covariance_yz_m2"] == 5
+    assert (row["part_1_palm_position_x_m"], row["part_2_palm_position_x_m"]) == (None, 4.0)
+    single = flatten_payload({"link": "tip", "parts": ()})
+    assert list(single) == list(row)
+    assert single["part_1_position_x_m"] is None
 
 
 def test_every_tick_has_a_row_of_counts_for_every_pad(recorded: Path, tables: Path) -> None:

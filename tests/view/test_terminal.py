@@ -157,6 +157,16 @@ def test_a_disconnected_daemon_differs_from_an_untouched_hand() -> None:
             "vector (  0.50,  -0.25,  -1.20) N",
         ),
         (replace(CONTACT, force_vector_status="invalid"), "vector invalid"),
+        (
+            replace(
+                CONTACT,
+                parts=(
+                    {"position_m": [0.001, 0.002, 0.003], "force_n": 1.5, "force_std_n": 0.25},
+                    {"position_m": [-0.01, 0.002, 0.003], "force_n": None, "force_std_n": None},
+                ),
+            ),
+            "2 contacts: (1.00, 2.00, 3.00) mm 1.50 +- 0.25 N and (-10.00, 2.00, 3.00) mm",
+        ),
         (replace(CONTACT, event="end", end_reason="lost"), "lost after 0.50 s, peak 2.50 N"),
     ],
 )

@@ -8,7 +8,7 @@ Public names: `TABLES`, `rows_of`, `Rows`.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
@@ -27,6 +27,8 @@ _AXES = {
     9: ("xx", "xy", "xz", "yx", "yy", "yz", "zx", "zy", "zz"),
 }
 _CHANNELS = ("x0_counts", "xa_counts", "y0_counts", "yb_counts")
+_PARTS, _MAX_PARTS = "parts", 2
+_PART_COLUMNS = tuple(field.name for field in fields(wire.ContactPart))
 _OMITTED_KEYS = ("v", "retained")
 _PAD_STATES = [state.name.lower() for state in wire.PadState]
 _SCALAR_TYPES = (bool, int, float, str, type(None))
@@ -70,6 +72,9 @@ def flatten_payload(payload: dict[str, Any]) -> Row:
     for name, value in payload.items():
         if name in _OMITTED_KEYS or isinstance(value, dict):
             continue
+        if name == _PARTS:
+            row |= _part_columns(value)
+            continue
         length = _VECTOR_LENGTHS.get(name)
         if length is not None:
             parts = value if value is not None else [None] * length
@@ -78,6 +83,21 @@ def flatten_payload(payload: dict[str, Any]) -> Row:
             row[name] = "; ".join(map(_item_text, value))
         elif isinstance(value, _SCALAR_TYPES):
             row[name] = value
+    return row
+
+
+def _part_columns(parts: Sequence[Mapping[str, Any]]) -> Row:
+    """Return the columns of two contacts on a pad: part_1_position_x_m ...; empty for one."""
+    row: Row = {}
+    for number in range(_MAX_PARTS):
+        part = parts[number] if number < len(parts) else {}
+        values = {f"part_{number + 1}_{name}": part.get(name) for name in _PART_COLUMNS}
+        for name, value in values.items():
+            length = _VECTOR_LENGTHS.get(name.split("_", 2)[2])
+            if length is None:
+                row[name] = value
+                continue
+            row |= dict(zip(component_names(name, length), value or [None] * length, strict=True))
     return row
 
 

@@ -31,10 +31,19 @@ def contact_line(contact: wire.Contact) -> str:
         parts.append(f"vector ({fx:6.2f}, {fy:6.2f}, {fz:6.2f}) N")
     elif contact.force_vector_status != "not_computed":
         parts.append(f"vector {contact.force_vector_status}")
+    if contact.parts:
+        parts.append(f"{len(contact.parts)} contacts: {' and '.join(map(part_text, contact.parts))}")
     if contact.event == "end":
         peak = "" if contact.peak_force_n is None else f", peak {contact.peak_force_n:.2f} N"
         parts.append(f"{contact.end_reason} after {contact.duration_s:.2f} s{peak}")
     return "  ".join(parts)
+
+
+def part_text(part: Mapping[str, Any]) -> str:
+    """Format one of two contacts on a pad, a `wire.ContactPart`."""
+    x, y, z = (1e3 * value for value in part["position_m"])
+    force = "" if part["force_n"] is None else f" {part['force_n']:.2f} +- {part['force_std_n'] or 0.0:.2f} N"
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) mm{force}"
 
 
 def palm_position_text(contact: wire.Contact) -> str:

@@ -31,6 +31,12 @@ struct Place {
     std::string status = "not_computed";
 };
 
+// One of two contacts on a pad at once.
+struct ContactPart {
+    Place in_link, in_palm, in_base;  // their statuses are those of the contact
+    std::optional<double> force_n, force_std_n;
+};
+
 // `contact/<hand>/<link>`: begin, update or end of one contact. Fields as in docs/wire.md.
 struct Contact {
     std::int64_t session = 0, seq = 0, t_ns = 0, begin_ns = 0, id = 0, group = 0;
@@ -48,6 +54,7 @@ struct Contact {
     std::string force_vector_status = "not_computed";
     std::optional<Vector<3>> force_vector_n, palm_force_vector_n, base_force_vector_n;
     std::optional<Vector<9>> force_vector_covariance_n2;
+    std::vector<ContactPart> parts;  // two where the currents show two contacts, else empty
 };
 
 // A column of a hand frame: N elements for each link; empty where no scene requests it.
@@ -199,6 +206,19 @@ inline Contact decode_contact(std::string_view payload) {
     made.force_vector_covariance_n2 = detail::vector<9>(map.find("force_vector_covariance_n2"));
     made.palm_force_vector_n = detail::vector<3>(map.find("palm_force_vector_n"));
     made.base_force_vector_n = detail::vector<3>(map.find("base_force_vector_n"));
+    if (const Value* parts = map.find("parts"))
+        for (const Value& part : parts->as_array()) {
+            ContactPart read;
+            read.in_link = detail::place(part, "", "position_status");
+            read.in_palm = detail::place(part, "palm_", "palm_status");
+            read.in_base = detail::place(part, "base_", "base_status");
+            read.in_link.status = map.at("position_status").as_text();
+            read.in_palm.status = made.in_palm.status;
+            read.in_base.status = made.in_base.status;
+            read.force_n = detail::maybe(part.find("force_n"));
+            read.force_std_n = detail::maybe(part.find("force_std_n"));
+            made.parts.push_back(read);
+        }
     return made;
 }
 
