@@ -61,6 +61,29 @@ void print_place(const std::string& prefix, const std::string& status, const han
     field(status, place.status);
 }
 
+void print_vectors(const std::string& prefix, const handtouch::Place& place) {
+    if (!place.position_m) return;
+    field(prefix + "position_m", place.position_m);
+    field(prefix + "normal", place.normal);
+    field(prefix + "covariance_m2", place.covariance_m2);
+}
+
+void print_parts(const std::vector<handtouch::ContactPart>& parts) {
+    std::fputs(",\"parts\":[", stdout);
+    const char* separator = "";
+    for (const handtouch::ContactPart& part : parts) {
+        std::printf("%s{\"force_n\":", separator);
+        print(part.force_n);
+        field("force_std_n", part.force_std_n);
+        print_vectors("", part.in_link);
+        print_vectors("palm_", part.in_palm);
+        print_vectors("base_", part.in_base);
+        std::putchar('}');
+        separator = ",";
+    }
+    std::putchar(']');
+}
+
 void print_contact(const handtouch::Contact& c) {
     std::printf("{\"kind\":\"contact\"");
     field("session", c.session); field("seq", c.seq); field("t_ns", c.t_ns); field("begin_ns", c.begin_ns);
@@ -80,6 +103,7 @@ void print_contact(const handtouch::Contact& c) {
     field("force_vector_status", c.force_vector_status); field("force_vector_n", c.force_vector_n);
     field("force_vector_covariance_n2", c.force_vector_covariance_n2);
     field("palm_force_vector_n", c.palm_force_vector_n); field("base_force_vector_n", c.base_force_vector_n);
+    print_parts(c.parts);
     std::puts("}");
 }
 

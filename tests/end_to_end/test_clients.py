@@ -91,6 +91,8 @@ def _assert_same(line: dict[str, Any], message: wire.Message) -> None:
 
 def _as(value: Any, got: Any) -> Any:
     """Floats where these are expected: JSON of JavaScript has no ".0"."""
+    if isinstance(value, dict) and isinstance(got, dict) and value.keys() == got.keys():
+        return {name: _as(item, got[name]) for name, item in value.items()}
     if isinstance(value, list) and isinstance(got, list):
         return [_as(*pair) for pair in zip(value, got, strict=True)]
     return float(got) if isinstance(value, float) and isinstance(got, int) else got
@@ -107,6 +109,12 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
         if rng.random() < 0.5:
             return None
         return tuple(real(*shape).tolist()) if shape else float(real())
+
+    def part() -> dict[str, Any]:
+        sizes = {"position_m": 3, "normal": 3, "covariance_m2": 9}
+        frames = [prefix for prefix in ("", "palm_", "base_") if not prefix or rng.random() < 0.5]
+        vectors = {f"{frame}{name}": real(size).tolist() for frame in frames for name, size in sizes.items()}
+        return {"force_n": maybe(), "force_std_n": maybe(), **vectors}
 
     def pick(codes: Any) -> Any:
         return list(codes)[rng.integers(len(codes))].text
@@ -154,6 +162,7 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
                 palm_status=pick(wire.FrameStatus),
                 base_status=pick(wire.FrameStatus),
                 diagnoses=("gum", "worn")[: rng.integers(3)],
+                parts=(part(), part()) if rng.random() < 0.5 else (),
             )
 
 
