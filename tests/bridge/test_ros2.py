@@ -39,7 +39,7 @@ from tests.client.hand_messages import make_contact, make_frame
 PACKAGE = Path(__file__).parents[2] / "clients" / "ros2" / "handtouch_msgs"
 WALL_OFFSET_NS = 1_700_000_000_000_000_123
 NOT_ON_ROS = {"v", "session", "seq", "t_ns", "retained", "frame", "begin_ns", "parts"}
-"""Fields of `contact` that are in the headers, in `begin`, or about the transport; two contacts of one pad"""
+"""Fields of `contact` that are in the headers, in `begin`, or about the transport; and lists of structures"""
 
 
 def typestore(release: Stores) -> Any:
@@ -125,6 +125,45 @@ def test_every_field_of_a_contact_is_decoded_by_ros(store: Any) -> None:
             assert np.isnan(received).all(), field.name
         else:
             assert np.array_equal(np.asarray(received), np.asarray(sent)), field.name
+
+
+PARTS = tuple(
+    {
+        "position_m": [x, 0.02, 0.03],
+        "normal": [0.0, 0.6, 0.8],
+        "covariance_m2": [1e-8 * k for k in range(9)],
+        "force_n": force_n,
+        "force_std_n": None,
+        "palm_position_m": [x, 0.5, 0.25],
+        "palm_normal": [1.0, 0.0, 0.0],
+        "palm_covariance_m2": [1e-6] * 9,
+    }
+    for x, force_n in ((0.01, 1.5), (0.02, None))
+)
+
+
+def test_two_contacts_on_a_pad_are_decoded_by_ros(store: Any) -> None:
+    contacts = [replace(LOCATED, parts=PARTS), LOCATED, replace(LOCATED, parts=PARTS[::-1])]
+    encoded = encode_contacts(contacts, make_frame(seq=1), "palm", make_stamper())
+    decoded = store.deserialize_cdr(encoded, "handtouch_msgs/msg/ContactArray")
+    assert [len(contact.parts) for contact in decoded.contacts] == [2, 0, 2]
+    for contact, sent in zip(decoded.contacts, contacts, strict=True):
+        assert contact.calibration_id == sent.calibration_id
+        for received, part in zip(contact.parts, sent.parts, strict=True):
+            assert [received.position_m.x, received.position_m.y] == part["position_m"][:2]
+            assert received.covariance_m2.tolist() == part["covariance_m2"]
+            assert received.palm_position_m.y == 0.5
+            assert math.isnan(received.base_position_m.x)
+            assert np.array_equal(received.force_n, part["force_n"] or math.nan, equal_nan=True)
+
+
+def test_two_contacts_on_a_pad_have_points_that_expire() -> None:
+    markers = contact_markers(replace(LOCATED, parts=PARTS), 4, make_stamper())[3:]
+    assert [(marker.ns, marker.id, marker.pose.position.x) for marker in markers] == [
+        ("part", 8, 0.01),
+        ("part", 9, 0.02),
+    ]
+    assert all(marker.lifetime.nanosec > 0 for marker in markers)
 
 
 def test_a_wrench_is_the_force_on_the_link_about_its_origin(store: Any) -> None:

@@ -19,6 +19,8 @@ from handtouch.bridge.ros2.cdr import ENCAPSULATION, Layout
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 
 _CONTACTS, _CONTACT, _WRENCH = Layout(ros.ContactArray), Layout(ros.RosContact), Layout(ros.WrenchStamped)
+_PART = Layout(ros.RosContactPart)
+_PART_VECTORS = (("position_m", 3), ("normal", 3), ("covariance_m2", 9))
 _UNKNOWN_2, _UNKNOWN_3, _UNKNOWN_9 = ((math.nan,) * count for count in (2, 3, 9))
 _EVENTS = {"begin": 0, "update": 1, "end": 2}
 _POSITION_STATUS = {status.text: int(status) for status in PositionStatus}
@@ -37,6 +39,8 @@ _POINT_SIZE_M, _SHAFT_M, _HEAD_M, _MIN_ARROW_M, _ARROW_M_PER_N = 3e-3, 1.5e-3, 3
 _ELLIPSE_SIGMA = math.sqrt(5.991)
 """Half axes of the ellipse that contains 95 % of a normal distribution in two dimensions"""
 _MIN_AXIS_M = 1e-4
+_PART_LIFETIME = 0, 200_000_000
+"""Seconds and nanoseconds for which points of two contacts on one pad are shown"""
 _VALID_COLOR, _UNRELIABLE_COLOR = (0.1, 0.8, 0.3), (0.95, 0.6, 0.1)
 
 
@@ -73,6 +77,8 @@ def encode_contacts(
     data = _CONTACTS.encode((*header, frame.session, frame.tick, frame.hand, len(contacts)))
     for contact in contacts:
         data += _CONTACT.encode(_contact_values(contact, stamper), len(data))
+        for part in contact.parts:
+            data += _PART.encode(_part_values(part), len(data))
     return ENCAPSULATION + data
 
 
@@ -122,7 +128,21 @@ def _contact_values(contact: wire.Contact, stamper: Stamper) -> tuple[Any, ...]:
         *(contact.force_vector_covariance_n2 or _UNKNOWN_9),
         *(contact.palm_force_vector_n or _UNKNOWN_3),
         *(contact.base_force_vector_n or _UNKNOWN_3),
+        len(contact.parts),
     )
+
+
+def _part_values(part: Mapping[str, Any]) -> list[float]:
+    """Return the values of the fields of `ros.RosContactPart`, in their order; `part` is a
+    `wire.ContactPart`."""
+    values = [*_vectors(part, ""), _number(part["force_n"]), _number(part["force_std_n"])]
+    return [*values, *_vectors(part, "palm_"), *_vectors(part, "base_")]
+
+
+def _vectors(part: Mapping[str, Any], frame: str) -> Iterable[float]:
+    """Return position, normal and covariance in a frame; NaN where absent."""
+    for name, length in _PART_VECTORS:
+        yield from part.get(frame + name) or (math.nan,) * length
 
 
 def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes | None:
@@ -163,7 +183,7 @@ def _encode_wrench(t_ns: int, link: str, wrench: Sequence[float], stamper: Stamp
 def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> list[ros.Marker]:
     """Return the markers of an active contact with a position: point, force, and ellipse of 95 %.
 
-    `number` is that of the pad on its hand.
+    `number` is that of the pad on its hand. Two contacts on it have further points, which expire.
     """
     if contact.position_m is None or contact.normal is None:
         return removed_markers(contact.frame, contact.t_ns, number, stamper)
@@ -185,6 +205,13 @@ def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> lis
         markers.append(ros.Marker(header, "ellipse", number, action=_DELETE))
     else:
         markers.append(_ellipse(header, number, at, np.reshape(contact.covariance_m2, (3, 3)), color))
+    for k, part in enumerate(contact.parts):
+        at = ros.Point(*part["position_m"])
+        point = ros.Marker(
+            header, "part", 2 * number + k, _SPHERE, pose=ros.Pose(at), scale=size, color=color
+        )
+        point.lifetime = ros.Duration(*_PART_LIFETIME)
+        markers.append(point)
     for marker in markers:
         marker.frame_locked = True  # links move on between two messages
     return markers

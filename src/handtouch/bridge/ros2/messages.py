@@ -202,6 +202,23 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 
 
 @dataclass
+class RosContactPart(IdlStruct, typename="handtouch_msgs::msg::dds_::ContactPart_"):
+    """handtouch_msgs/ContactPart."""
+
+    position_m: Point
+    normal: Vector3
+    covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
+    force_n: float64
+    force_std_n: float64
+    palm_position_m: Point
+    palm_normal: Vector3
+    palm_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
+    base_position_m: Point
+    base_normal: Vector3
+    base_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
+
+
+@dataclass
 class RosContact(IdlStruct, typename="handtouch_msgs::msg::dds_::Contact_"):
     """handtouch_msgs/Contact."""
 
@@ -247,6 +264,7 @@ class RosContact(IdlStruct, typename="handtouch_msgs::msg::dds_::Contact_"):
     force_vector_covariance_n2: Annotated[Sequence[float64], array(float64, 9)]
     palm_force_vector_n: Vector3
     base_force_vector_n: Vector3
+    parts: Annotated[Sequence[RosContactPart], sequence(RosContactPart)]
 
 
 @dataclass
