@@ -117,6 +117,21 @@ def test_bodies_and_contacts_are_in_frames_of_links() -> None:
     assert entity["frame_id"] in at
 
 
+def test_two_contacts_of_a_pad_are_two_more_points_with_their_forces() -> None:
+    contact = {"event": "update", "id": 1, "hand": "right", "link": "index_distal", "frame": "index_distal"}
+    contact |= {"position_m": [0.01, 0, 0.01], "normal": [0, 0, 1], "force_n": 1.0, "force_status": "valid"}
+    parts = [
+        {"position_m": [x, 0, 0.01], "force_n": force_n} for x, force_n in ((0.005, 0.75), (0.015, None))
+    ]
+    foxglove = configured()
+    foxglove.convert("service", {"hands": {"right": LINKS}}, 10 * SECOND_NS)
+    scene = foxglove.convert("contact/right/index_distal", contact | {"parts": parts}, 10 * SECOND_NS)
+    (entity,) = next(fields(m) for m in scene if m.topic == SCENE_TOPIC)["entities"]
+    drawn = [sphere["pose"]["position"]["x"] for sphere in entity["spheres"]]
+    assert drawn == pytest.approx([0.005, 0.015, 0.01])
+    assert [text["text"] for text in entity["texts"]] == ["0.75 N", "index_distal 1.00 N"]
+
+
 @pytest.mark.parametrize("urdf", [b"", b"<robot/>"])
 def test_without_a_urdf_links_are_in_a_row(urdf: bytes) -> None:
     made = configured(urdf).convert("service", {"hands": {"right": LINKS}}, 10 * SECOND_NS)

@@ -197,9 +197,12 @@ def _body_entity(frame: str, shapes: list[urdf.BodyShape], t_ns: int) -> SceneEn
 def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -> SceneEntity:
     position, normal, force_n = contact["position_m"], contact["normal"], contact["force_n"]
     spheres, arrows, texts = [], [], []
+    color = _COLOR_OF_STATUS.get(contact["force_status"], _DEFAULT_COLOR)
+    size = _vector((0.003, 0.003, 0.003))
+    for part in contact.get("parts", ()):  # two contacts on one pad
+        spheres.append(SpherePrimitive(pose=_pose(part["position_m"]), size=size, color=color))
+        texts += [] if part["force_n"] is None else [_force_text(part["position_m"], "", part["force_n"])]
     if position is not None and normal is not None:
-        color = _COLOR_OF_STATUS.get(contact["force_status"], _DEFAULT_COLOR)
-        size = _vector((0.003, 0.003, 0.003))
         spheres.append(SpherePrimitive(pose=_pose(position), size=size, color=color))
         if force_n is not None:
             arrows.append(
@@ -212,16 +215,7 @@ def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -
                     color=color,
                 )
             )
-            texts.append(
-                TextPrimitive(
-                    pose=_pose(position),
-                    billboard=True,
-                    font_size=12.0,
-                    scale_invariant=True,
-                    color=_TEXT_COLOR,
-                    text=f"{contact['link']} {force_n:.2f} N",
-                )
-            )
+            texts.append(_force_text(position, f"{contact['link']} ", force_n))
     return SceneEntity(
         timestamp=_time(t_ns),
         frame_id=frame,
@@ -232,6 +226,17 @@ def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -
         spheres=spheres,
         arrows=arrows,
         texts=texts,
+    )
+
+
+def _force_text(position: Iterable[float], name: str, force_n: float) -> TextPrimitive:
+    return TextPrimitive(
+        pose=_pose(position),
+        billboard=True,
+        font_size=12.0,
+        scale_invariant=True,
+        color=_TEXT_COLOR,
+        text=f"{name}{force_n:.2f} N",
     )
 
 
