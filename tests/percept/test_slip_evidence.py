@@ -204,21 +204,22 @@ def test_motion_against_other_contacts_is_that_of_least_squares() -> None:
 
 
 def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
-    hands = RandomHands()
+    """The odds of a hand's only contact are higher by a constant."""
+    hands = RandomHands(missing=0.4)
     evidence, expected = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), np.full(RandomHands.PADS, np.nan)
     updated_ns = np.zeros(RandomHands.PADS, np.int64)
     for k in range(100):
         pads, now_ns = np.sort(hands.tick(k)), 10**9 + 5_000_000 * k
         evidence.update_odds(pads, now_ns)
         placed = np.isfinite(hands.buffer.latest_field(pads, "palm_position_m")[:, 0])
-        hand = hands.buffer.hand_index[pads]
-        placed &= np.bincount(hand[placed], minlength=2)[hand] > 1
         expected[pads[~placed]] = np.nan
         due = pads[placed]
         passed_s = (now_ns - updated_ns[due]) * 1e-9
         kept = np.nan_to_num(expected[due], nan=-50.0) - passed_s / 0.05
         own = SlipEvidence(hands.buffer, hands.slip, PERIOD_S).features(due)
-        expected[due] = np.maximum(SlipTrees.shipped().log_odds(own), kept)
+        contacts = np.bincount(hands.buffer.hand_index[due])[hands.buffer.hand_index[due]]
+        found = SlipTrees.shipped().log_odds(own) + 2.5 * (contacts == 1)
+        expected[due] = np.maximum(found, kept)
         updated_ns[due] = now_ns
         assert evidence.log_odds == pytest.approx(expected, rel=1e-9, abs=1e-9, nan_ok=True)
     before = evidence.log_odds.copy()
@@ -246,3 +247,59 @@ def test_velocity_against_the_object_is_that_of_least_squares() -> None:
             assert found.std == pytest.approx(np.hypot(1e-3, 1e-3 * std_mm / 0.05), rel=1e-8)
             compared += 1
     assert compared > 200
+
+
+def path_features(path_m: FloatArray, current_a: FloatArray) -> dict[str, FloatArray]:
+    """Features by name of the contact on one pad with this path (k, 2) and current (k,)."""
+    buffer, pads = ContactBuffer(1, length=22), np.zeros(1, np.intp)
+    for k, (place, current) in enumerate(zip(path_m, current_a, strict=True)):
+        sample = ContactSamples(pads, np.full(1, 10**9 + 5_000_000 * k), np.ones(1, np.uint32))
+        sample["pad_m"], sample["total_current_a"] = place[None], np.array([current])
+        buffer.add_samples(sample)
+    values = SlipEvidence(buffer, detector(1), PERIOD_S).features(pads)
+    return dict(zip(SLIP_FEATURES, values.T, strict=True))
+
+
+def test_load_that_shifts_moves_the_centroid_in_a_step_with_the_current() -> None:
+    shifted = np.arange(21) > 12
+    found = path_features(np.outer(shifted, [3e-4, 4e-4]), 1e-3 * np.where(shifted, 1.5, 1.0))
+    assert found["step_mm_100ms"] == pytest.approx([0.5])
+    assert found["straightness_100ms"] == pytest.approx([1.0])
+    assert found["explained_by_current_100ms"] == pytest.approx([1.0], abs=1e-4)
+
+
+def test_slip_at_constant_force_moves_the_centroid_steadily() -> None:
+    found = path_features(np.outer(np.arange(21), [3e-5, 4e-5]), np.full(21, 1e-3))
+    assert found["step_mm_100ms"] == pytest.approx([0.05])
+    assert found["straightness_100ms"] == pytest.approx([1.0])
+    assert found["explained_by_current_100ms"] == pytest.approx([0.0], abs=1e-9)
+
+
+def test_chatter_returns_on_its_path() -> None:
+    found = path_features(np.outer(np.arange(21) % 2, [1e-4, 0.0]), np.full(21, 1e-3))
+    assert found["straightness_100ms"] == pytest.approx([0.0], abs=1e-9)
+
+
+def test_path_of_a_new_contact_or_without_current_is_unknown() -> None:
+    names = ("step_mm_100ms", "straightness_100ms", "explained_by_current_100ms")
+    still = np.zeros((21, 2))
+    for found in (path_features(still[:20], np.full(20, 1e-3)), path_features(still, np.zeros(21))):
+        assert all(np.isnan(found[name]).all() for name in names)
+
+
+def test_features_of_other_contacts_leave_out_the_contact_itself() -> None:
+    hands = RandomHands()
+    evidence, at = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), SLIP_FEATURES.index("others_slipping")
+    for k in range(60):
+        pads = hands.tick(k)
+        found = evidence.features(pads)
+        change = np.abs(found[:, SLIP_FEATURES.index("log_current_change_20ms")])
+        for row, pad in enumerate(pads):
+            others = (hands.buffer.hand_index[pads] == hands.buffer.hand_index[pad]) & (pads != pad)
+            known = change[others & np.isfinite(change)]
+            expected = (
+                found[others, SLIP_FEATURES.index("slipping")].sum(),
+                found[others, SLIP_FEATURES.index("log_ratio")].max(initial=-20.0),
+                known.mean() if len(known) else np.nan,
+            )
+            assert found[row, at : at + 3] == pytest.approx(expected, rel=1e-9, nan_ok=True)

@@ -1,8 +1,8 @@
 """Percept `motion`: sticking, incipient slip, sliding, rolling or lift-off of every contact.
 
 The slip stage of the core detects whether a centroid has begun to move. Without joint states a moving
-centroid counts as sliding, with a fixed prior probability of rolling. With joint states of several contacts
-of a hand `handtouch.percept.slip_evidence` computes the odds of slip from the motion of centroid and links;
+centroid counts as sliding, with a fixed prior probability of rolling. With joint states
+`handtouch.percept.slip_evidence` computes the odds of slip from the motion of centroid and links;
 and a contact slides, too, whose link moves against the object by more than the joints' deviations explain:
 the object is a rigid body held by the hand's other sticking contacts.
 

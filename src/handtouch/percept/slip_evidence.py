@@ -88,7 +88,7 @@ class SlipEvidence:
     def update_odds(self, pads: IntArray, now_ns: int) -> None:
         """Update the odds of contacts on pads (k,) whose newest sample is of `now_ns`, every 5 ms at most.
 
-        They become NaN on a hand that touches with one pad alone, or whose links' poses are unknown.
+        They become NaN where the pose of a contact's link is unknown.
         """
         self._stage.update_odds(np.sort(pads).data, now_ns)
 

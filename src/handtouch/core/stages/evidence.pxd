@@ -4,6 +4,9 @@ from libc cimport math
 cdef Py_ssize_t _COUNT, _WINDOWS, _LINK_WINDOWS, _HAND_WINDOWS
 cdef Py_ssize_t _LOG_RATIO, _SLIPPING, _SPEED, _ONSET_AGE, _FORCE_RATE, _CURRENT_CHANGE, _MOVED
 cdef Py_ssize_t _TURNED, _LINK_MOVED, _RELATIVE, _RELATIVE_STD, _HAND_TURNED
+cdef Py_ssize_t _OTHERS_SLIPPING, _OTHERS_RATIO, _OTHERS_CHANGE, _STEP, _STRAIGHTNESS, _EXPLAINED, _PALM_MOVED
+cdef Py_ssize_t _OTHERS_WINDOW, _PATH_WINDOW, _PATH_STEPS
+cdef double _MIN_PATH_M, _MIN_CURRENT_VARIANCE
 cdef Py_ssize_t _PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION
 cdef Py_ssize_t _SLIP_ROW, _ROW_LOG_RATIO, _ROW_SLIPPING, _ROW_ONSET_AGE, _ROW_FORCE, _ROW_RATE, _ROW_VELOCITY
 cdef Py_ssize_t _ROW_LOG_ODDS, _JOINTS_M2, _VELOCITY_WINDOW, _MAX_AGE_NS
@@ -11,15 +14,14 @@ cdef double _MAX_LOG_RATIO, _MIN_LOG_RATIO, _MIN_FORCE_N, _CONTACT_VARIANCE_M2
 cdef double _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S, _MAX_HOLDING_LOG_RATIO, _LINK_SPEED_STD_M_PER_S
 cdef double _MAX_STICKING_LOG_ODDS
 cdef Py_ssize_t _UPDATE_NS
-cdef double _MIN_LOG_ODDS, _ODDS_DECAY_S, _MIN_PIVOT, _NAN, _INFINITY
+cdef double _ALONE_LOG_ODDS, _MIN_LOG_ODDS, _ODDS_DECAY_S, _MIN_PIVOT, _NAN, _INFINITY
 cdef Py_ssize_t _MOTION, _INFORMATION, _WEIGHTED, _FACTOR, _BODY, _POINT, _OFF
 
 cdef class EvidenceStage:
     cdef double[::1] history, windows, slip, thresholds, leaves, features, log_odds, ways, work, velocities, velocity_std
     cdef Py_ssize_t[::1] sample_count, offsets, steps, hands, tested, evidence_ns, due, sample_ns
     cdef Py_ssize_t length, width, levels, trees
-    @cython.locals(count=Py_ssize_t, first=Py_ssize_t, stop=Py_ssize_t, placed=Py_ssize_t, k=Py_ssize_t,
-                   pad=Py_ssize_t)
+    @cython.locals(count=Py_ssize_t, k=Py_ssize_t, pad=Py_ssize_t, waits=bint, before=bint, after=bint)
     cpdef update_odds(self, Py_ssize_t[::1] pads, Py_ssize_t now_ns)
     @cython.locals(pad=Py_ssize_t)
     cpdef compute_velocities(self, Py_ssize_t now_ns)
@@ -46,6 +48,13 @@ cdef void _compute_own_features(EvidenceStage stage, Py_ssize_t pad) noexcept
                ways='double[::1]', now=Py_ssize_t, before=Py_ssize_t, r=Py_ssize_t, q=Py_ssize_t, n=Py_ssize_t,
                i=Py_ssize_t)
 cdef void _compute_link_motion(EvidenceStage stage, Py_ssize_t pad, Py_ssize_t link_window) noexcept
+@cython.locals(row=Py_ssize_t, history='double[::1]', features='double[::1]', now=Py_ssize_t, at=Py_ssize_t,
+               current=Py_ssize_t, steps=Py_ssize_t, before=Py_ssize_t, p=Py_ssize_t, o=Py_ssize_t, i=Py_ssize_t,
+               stride=Py_ssize_t, back=Py_ssize_t, later=Py_ssize_t, earlier=Py_ssize_t)
+cdef void _compute_path(EvidenceStage stage, Py_ssize_t pad) noexcept
+@cython.locals(features='double[::1]', at=Py_ssize_t, k=Py_ssize_t, row=Py_ssize_t)
+cdef void _compute_others(
+    EvidenceStage stage, Py_ssize_t[::1] pads, Py_ssize_t first, Py_ssize_t stop) noexcept
 @cython.locals(history='double[::1]', q=Py_ssize_t, p=Py_ssize_t, o=Py_ssize_t, i=Py_ssize_t)
 cdef void _compute_material_way(
     EvidenceStage stage, Py_ssize_t pad, Py_ssize_t now, Py_ssize_t before) noexcept

@@ -21,13 +21,21 @@ SLIP_FEATURES = (
     *(f"relative_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
     *(f"relative_std_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
     *(f"hand_turned_rad_{ms}ms" for ms in _HAND_WINDOW_MS),
+    "others_slipping", "others_log_ratio", "others_current_change_20ms",
+    "step_mm_100ms", "straightness_100ms", "explained_by_current_100ms", "palm_moved_mm_100ms",
 )  # fmt: skip
 """Names of features; each is NaN where a contact or its link's pose hasn't been known for long enough.
 
 log_ratio to relative_force_rate: of the slip stage. Over windows: change of ln of the total current; way of
 the centroid on the pad; rotation of the link in the palm; tangential way of the link's material at the
 contact; that way relative to a rigid body on the hand's other contacts, and the deviation of that body's way
-by geometry, for contacts each known within 0.1 mm; the largest rotation of a touched link of the hand."""
+by geometry, for contacts each known within 0.1 mm; the largest rotation of a touched link of the hand.
+
+others: of the hand's other contacts, the number that slip by the slip stage, the largest log_ratio, and the
+mean absolute change of ln of the current. step to palm_moved: of the centroid's path on the pad, in samples
+5 ms apart, the longest step, the way over the length, and the share of its variance that a linear dependence
+on ln of the current explains; and the way of the contact in the palm. A load that shifts to another part of
+the pad moves the centroid in a step, as the current changes, while no other contact slips."""
 EVIDENCE_WINDOWS_S = tuple(1e-3 * ms for ms in _WINDOW_MS)
 """Windows [s] of features."""
 EVIDENCE_FIELDS = (
@@ -45,6 +53,10 @@ _LINK_MOVED = _TURNED + _LINK_WINDOWS
 _RELATIVE = _LINK_MOVED + _LINK_WINDOWS
 _RELATIVE_STD = _RELATIVE + _LINK_WINDOWS
 _HAND_TURNED = _RELATIVE_STD + _LINK_WINDOWS
+_OTHERS_SLIPPING = _HAND_TURNED + _HAND_WINDOWS
+_OTHERS_RATIO, _OTHERS_CHANGE, _STEP = _OTHERS_SLIPPING + 1, _OTHERS_SLIPPING + 2, _OTHERS_SLIPPING + 3
+_STRAIGHTNESS, _EXPLAINED, _PALM_MOVED = _OTHERS_SLIPPING + 4, _OTHERS_SLIPPING + 5, _OTHERS_SLIPPING + 6
+_OTHERS_WINDOW, _PATH_WINDOW, _PATH_STEPS = 1, 3, 20
 _PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION, _JOINTS_M2 = 0, 1, 2, 3, 4, 5, 6
 
 _SLIP_ROW = SLIP_COUNT
@@ -67,7 +79,9 @@ _VELOCITY_WINDOW, _MAX_AGE_NS = 2, 50_000_000
 _MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
 _MAX_HOLDING_LOG_RATIO = 3.0  # ln R of a contact that counts as sticking to the object
 _UPDATE_NS = 4_500_000
+_ALONE_LOG_ODDS = 2.5  # added for a hand's only contact: nothing holds the object against slipping there
 _MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
+_MIN_PATH_M, _MIN_CURRENT_VARIANCE = 1e-8, 1e-6
 _MIN_PIVOT = 1e-6  # information is that of the prior at least, 1e3 and more
 _NAN, _INFINITY = float("nan"), float("inf")
 
@@ -128,29 +142,31 @@ class EvidenceStage:
     def update_odds(self, pads: memoryview[int], now_ns: int) -> None:
         """Update the odds of slip of the contacts on these pads, ascending, by samples up to `now_ns`.
 
-        They are NaN on a hand that touches with one pad alone, or whose links' poses are unknown. Contacts
-        updated within 4.5 ms are left out.
+        They are NaN where the pose of a contact's link is unknown. All are updated together, where one was
+        last updated more than 4.5 ms ago.
         """
-        count = first = 0
-        while first < len(pads):
-            stop, placed = first, 0
-            while stop < len(pads) and self.hands[pads[stop]] == self.hands[pads[first]]:
-                placed += _is_placed(self, pads[stop])
-                stop += 1
-            for k in range(first, stop):
-                pad = pads[k]
-                if placed < 2 or not _is_placed(self, pad):
-                    self.log_odds[pad] = _NAN
-                elif now_ns - self.evidence_ns[pad] >= _UPDATE_NS:
-                    self.due[count] = pad
-                    count += 1
-            first = stop
+        count, waits = 0, True
+        for k in range(len(pads)):
+            pad = pads[k]
+            if _is_placed(self, pad):
+                self.due[count] = pad
+                count += 1
+                if now_ns - self.evidence_ns[pad] >= _UPDATE_NS:
+                    waits = False
+            else:
+                self.log_odds[pad] = _NAN
+        if waits:
+            return
         _compute_features(self, self.due, count)
         for k in range(count):
             pad = self.due[k]
-            before = self.log_odds[pad] if self.log_odds[pad] > _MIN_LOG_ODDS else _MIN_LOG_ODDS
-            kept = before - (now_ns - self.evidence_ns[pad]) * 1e-9 / _ODDS_DECAY_S
             found = _sum_trees(self, pad)
+            before = k > 0 and self.hands[self.due[k - 1]] == self.hands[pad]
+            after = k + 1 < count and self.hands[self.due[k + 1]] == self.hands[pad]
+            if not before and not after:
+                found += _ALONE_LOG_ODDS
+            last = self.log_odds[pad] if self.log_odds[pad] > _MIN_LOG_ODDS else _MIN_LOG_ODDS
+            kept = last - (now_ns - self.evidence_ns[pad]) * 1e-9 / _ODDS_DECAY_S
             self.log_odds[pad] = found if found > kept else kept
             self.evidence_ns[pad] = now_ns
 
@@ -254,6 +270,9 @@ def _compute_features(stage: EvidenceStage, pads: memoryview[int], count: int) -
                     largest = angle
             for k in range(first, stop):
                 stage.features[pads[k] * _COUNT + _HAND_TURNED + hand_window] = largest
+        for k in range(first, stop):
+            _compute_path(stage, pads[k])
+        _compute_others(stage, pads, first, stop)
         first = stop
 
 
@@ -285,6 +304,87 @@ def _compute_own_features(stage: EvidenceStage, pad: int) -> None:
         at = stage.offsets[_PAD_M]
         x, y = history[now + at] - history[before + at], history[now + at + 1] - history[before + at + 1]
         features[row + _MOVED + window] = 1e3 * math.sqrt(x * x + y * y)
+
+
+def _compute_path(stage: EvidenceStage, pad: int) -> None:
+    """Compute the features of the centroid's path on the pad over 100 ms; NaN where it isn't known."""
+    row, history, features, now = pad * _COUNT, stage.history, stage.features, _sample_at(stage, pad, 0)
+    at, current, steps = stage.offsets[_PAD_M], stage.offsets[_CURRENT], stage.steps[_PATH_WINDOW]
+    features[row + _STEP] = features[row + _STRAIGHTNESS] = features[row + _EXPLAINED] = _NAN
+    features[row + _PALM_MOVED] = _NAN
+    before = _sample_at(stage, pad, steps)
+    if before < 0:
+        return
+    p, o, square = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION], 0.0
+    for i in range(3):
+        square += (history[p + i] - history[o + i]) * (history[p + i] - history[o + i])
+    features[row + _PALM_MOVED] = 1e3 * math.sqrt(square)
+    stride = (steps + _PATH_STEPS - 1) // _PATH_STEPS
+    longest = length = count = 0.0
+    sum_c = sum_x = sum_y = sum_cc = sum_cx = sum_cy = sum_xx = 0.0
+    origin_x, origin_y, origin_a = history[now + at], history[now + at + 1], history[now + current]
+    if not 0.0 < origin_a < _INFINITY:
+        return
+    back = 0
+    while back < steps:
+        later = _sample_at(stage, pad, back)
+        back = back + stride if back + stride < steps else steps
+        earlier = _sample_at(stage, pad, back)
+        x, y = (
+            history[later + at] - history[earlier + at],
+            history[later + at + 1] - history[earlier + at + 1],
+        )
+        step = math.sqrt(x * x + y * y)
+        length += step
+        if step > longest:
+            longest = step
+        if not 0.0 < history[later + current] < _INFINITY:
+            return
+        c = math.log(history[later + current] / origin_a)
+        x, y = history[later + at] - origin_x, history[later + at + 1] - origin_y
+        sum_c, sum_x, sum_y, count = sum_c + c, sum_x + x, sum_y + y, count + 1.0
+        sum_cc, sum_cx, sum_cy = sum_cc + c * c, sum_cx + c * x, sum_cy + c * y
+        sum_xx += x * x + y * y
+    x, y = origin_x - history[before + at], origin_y - history[before + at + 1]
+    if not length < _INFINITY:
+        return
+    features[row + _STEP] = 1e3 * longest
+    features[row + _STRAIGHTNESS] = math.sqrt(x * x + y * y) / (
+        length if length > _MIN_PATH_M else _MIN_PATH_M
+    )
+    variance = (sum_xx - (sum_x * sum_x + sum_y * sum_y) / count) / count
+    c = (sum_cc - sum_c * sum_c / count) / count + _MIN_CURRENT_VARIANCE
+    x, y = (sum_cx - sum_c * sum_x / count) / count, (sum_cy - sum_c * sum_y / count) / count
+    if variance < _MIN_PATH_M * _MIN_PATH_M:
+        variance = _MIN_PATH_M * _MIN_PATH_M
+    features[row + _EXPLAINED] = (x * x + y * y) / (c * variance)
+
+
+def _compute_others(stage: EvidenceStage, pads: memoryview[int], first: int, stop: int) -> None:
+    """Compute the features of a hand's contacts that are about its others; NaN where there is none."""
+    features, slipping, known, change = stage.features, 0.0, 0.0, 0.0
+    largest, second, at = _MIN_LOG_RATIO, _MIN_LOG_RATIO, -1
+    for k in range(first, stop):
+        row = pads[k] * _COUNT
+        slipping += features[row + _SLIPPING]
+        part = math.fabs(features[row + _CURRENT_CHANGE + _OTHERS_WINDOW])
+        if part < _INFINITY:
+            known, change = known + 1.0, change + part
+        if features[row + _LOG_RATIO] > largest:
+            largest, second, at = features[row + _LOG_RATIO], largest, k
+        elif features[row + _LOG_RATIO] > second:
+            second = features[row + _LOG_RATIO]
+    for k in range(first, stop):
+        row = pads[k] * _COUNT
+        own = math.fabs(features[row + _CURRENT_CHANGE + _OTHERS_WINDOW])
+        features[row + _OTHERS_SLIPPING] = slipping - features[row + _SLIPPING]
+        features[row + _OTHERS_RATIO] = second if k == at else largest
+        features[row + _OTHERS_CHANGE] = _NAN
+        if own < _INFINITY:
+            if known > 1.5:
+                features[row + _OTHERS_CHANGE] = (change - own) / (known - 1.0)
+        elif known > 0.5:
+            features[row + _OTHERS_CHANGE] = change / known
 
 
 def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> None:
