@@ -437,6 +437,14 @@ def test_short_on_a_sheet_of_another_resistance_is_no_saturated_channel() -> Non
     assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("x0",))
 
 
+@pytest.mark.parametrize("series_ohm", [150.0, 900.0])
+def test_short_behind_a_series_resistor_is_diagnosed(series_ohm: float) -> None:
+    """Its channel is at the end of its range, or below it; the others carry less than without resistors."""
+    fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 1.0, "electrode": "y0", "short_ohm": 20.0}
+    (found,) = simulate(fault, 25, series_ohm=(series_ohm,) * 4)
+    assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("y0",))
+
+
 def test_saturation_under_a_lasting_contact_is_less_certain() -> None:
     held, _ = play(lambda _, __: np.array([2000, 1500, 900, 1e6]), 25)
     (found,) = held.diagnoses()

@@ -29,6 +29,8 @@ _MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the others ge
 # of the nominal sheet, whose resistance isn't known better; and the deviation of each from the nominal share
 _IDLE_RATIO_RANGE = (0.3, 3.0)
 _MAX_IDLE_DEVIATION, _MAX_IDLE_DEVIATION_OF_SUM = 0.3, 0.03
+_MIN_SHORT_FRACTION = 0.75
+"""Of the current through an electrode's series resistor, at which it may be shorted to the layer."""
 _MIN_CHANNELS_OF_SHORT = 2
 _MIN_WINDOW_NS = 5_000_000_000
 """The lowest readings of the other channels are those of the last one to two such times."""
@@ -67,6 +69,9 @@ class ChannelFaultDetector:
         self._recent_min_counts = self._min_counts.copy()  # the same within the present part of a window
         self._last_ns = np.zeros((n, 1), dtype=np.int64)
         self._idle_counts = [_idle_counts(model, row) for row in range(n)]  # (shorted, channels) of each pad
+        self._short_counts = np.full((n, c), np.inf)  # of a channel whose electrode is shorted
+        for row, idle in enumerate(self._idle_counts):
+            self._short_counts[row, : len(idle)] = np.diag(idle)
         self.faults: dict[tuple[int, int], ChannelFault] = {}
 
     @property
@@ -95,7 +100,8 @@ class ChannelFaultDetector:
         begins = features.varied | (self._repeats == 0)
         self._repeats_since_ns = np.where(begins, t_ns, self._repeats_since_ns)
         self._repeats = np.where(features.varied, 0, self._repeats) + features.trailing_repeats
-        railed = features.railed_fraction >= 1.0
+        at_end = features.railed_fraction >= 1.0
+        railed = at_end | (features.mean_counts.min(axis=0) > _MIN_SHORT_FRACTION * self._short_counts)
         self._railed_since_ns = np.where(
             railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
         )
@@ -112,7 +118,9 @@ class ChannelFaultDetector:
         stuck = self._used & (self._repeats >= self._max_repeats[:, None])
         for pad, channel in np.argwhere(railed | stuck).tolist():
             fault = self._classify(pad, channel, features)
-            if fault is not None:
+            if fault is not None and (
+                at_end[pad, channel] or stuck[pad, channel] or fault.kind == FaultKind.SHORTED_ELECTRODE
+            ):
                 self._healthy_since_ns[pad, channel] = -1
                 before = self.faults.get((pad, channel))
                 if before is not None and self._is_settled(pad, channel, before):
@@ -186,11 +194,22 @@ def _repeat_probability(std: FloatArray) -> FloatArray:
 
 
 def _idle_counts(model: DiagnosisModel, row: int) -> FloatArray:
-    """Return counts [shorted, channel] with an electrode at the layer's potential; infinite if unknown."""
+    """Return counts [shorted, channel] with an electrode at the layer's potential; infinite if unknown.
+
+    Its own channel gets what its series resistor lets through, the others what flows through sheet and
+    resistors.
+    """
     network = model.networks[row]
+    series, volts = np.asarray(network.series_ohm, np.float64), model.drive_v[row]
+    scale = model.ampere_per_count[row, : len(series)]
     try:
         conductance = network.conductance / network.sheet_ohm_per_square
     except ValueError:
-        return np.full((len(network.series_ohm),) * 2, np.inf)
-    volts = model.drive_v[row]
-    return np.asarray(-volts * conductance / model.ampere_per_count[row, : len(conductance)])
+        return np.full((len(series),) * 2, np.inf)
+    idle = np.empty((len(series),) * 2)
+    for shorted in range(len(series)):
+        others = np.arange(len(series)) != shorted
+        loaded = np.eye(len(series) - 1) + conductance[np.ix_(others, others)] * series[others]
+        idle[shorted, others] = np.linalg.solve(loaded, -volts * conductance[others, shorted])
+        idle[shorted, shorted] = volts / series[shorted] if series[shorted] else np.inf
+    return np.asarray(idle / scale)
