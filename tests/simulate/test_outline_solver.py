@@ -41,6 +41,16 @@ def test_contacts_at_rest_on_a_grounded_disc_have_the_mutual_resistance_of_image
     assert len(set(found.tolist())) == 1
 
 
+def test_contacts_that_rest_one_after_the_other_need_no_table() -> None:
+    outline_mutual_resistance.cache_clear()
+    green = outline_mutual_resistance(DISC, GROUNDED)
+    one, other = np.repeat(np.array(PAIRS).transpose(1, 2, 0), TIMES, axis=2)
+    found = green.resistance_ohm(one, other, np.full(TIMES * len(PAIRS), 1e-4))
+    solved = [green.static_resistance_ohm(*a, *b, 1e-4) for a, b in PAIRS]
+    assert found.tolist() == np.repeat(solved, TIMES).tolist()
+    assert "_table" not in vars(green)
+
+
 def test_the_mutual_resistance_of_contacts_at_rest_is_that_of_the_table_of_moving_ones() -> None:
     green = outline_mutual_resistance(DISC, GROUNDED)
     (one, other), few = np.array(PAIRS).transpose(1, 2, 0), np.full(len(PAIRS), 1e-4)

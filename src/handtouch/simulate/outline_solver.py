@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 _DEGREE, _RADIUS_DEGREE, _ARC_RADIUS_DEGREE = 5, 4, 3  # arcs have more elements
 _MIN_GAP_FRACTION = 1e-3  # of a side
 _MIN_ARC_FRACTION = 1e-4  # of a side: shorter parts of an electrode are left out
-_MIN_STATIC_TIMES = 20  # of two contacts that don't move, from which on they are solved without a table
+_MIN_STATIC_TIMES = 20  # of each two contacts that don't move, from which on they are solved without a table
 _TABLE_DEGREE = 12
 _NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
 _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
@@ -102,10 +102,10 @@ class _OutlineMutualResistance(MutualResistance):
 
     def resistance_ohm(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
         """Return the resistance (n,) between positions (2, n) [fractions], at least `nearest_m` apart."""
-        is_static = all((values == values[..., :1]).all() for values in (one, other, nearest_m))
-        if is_static and len(nearest_m) >= _MIN_STATIC_TIMES:
-            positions = (*one[:, 0].tolist(), *other[:, 0].tolist())
-            return np.full(len(nearest_m), self.static_resistance_ohm(*positions, float(nearest_m[0])))
+        pairs, times = np.unique(np.stack([*one, *other, nearest_m]), axis=1, return_inverse=True)
+        if _MIN_STATIC_TIMES * pairs.shape[1] <= len(nearest_m):  # contacts that rest, one after the other
+            solved = [self.static_resistance_ohm(*pair) for pair in pairs.T.tolist()]
+            return np.array(solved)[times.ravel()]
         return np.asarray(self._regular_part(one, other) + self._direct_part(one, other, nearest_m))
 
     def _direct_part(self, one: FloatArray, other: FloatArray, nearest_m: FloatArray) -> FloatArray:
