@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.evidence import SLIP_FEATURES
+from handtouch.core.stages.evidence import ALONE_LOG_ODDS, SLIP_FEATURES
 from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.percept.samples import ContactBuffer, ContactSamples
@@ -218,7 +218,7 @@ def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
         kept = np.nan_to_num(expected[due], nan=-50.0) - passed_s / 0.05
         own = SlipEvidence(hands.buffer, hands.slip, PERIOD_S).features(due)
         contacts = np.bincount(hands.buffer.hand_index[due])[hands.buffer.hand_index[due]]
-        found = SlipTrees.shipped().log_odds(own) + 2.5 * (contacts == 1)
+        found = SlipTrees.shipped().log_odds(own) + ALONE_LOG_ODDS * (contacts == 1)
         expected[due] = np.maximum(found, kept)
         updated_ns[due] = now_ns
         assert evidence.log_odds == pytest.approx(expected, rel=1e-9, abs=1e-9, nan_ok=True)

@@ -1,6 +1,7 @@
 """Evidence of slip by joint states: features of contacts on moving links, and boosted trees that sum it.
 
-Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`, `EVIDENCE_WORK`.
+Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`, `EVIDENCE_WORK`,
+`ALONE_LOG_ODDS`.
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ EVIDENCE_FIELDS = (
 )  # fmt: skip
 """Fields of samples that features are computed from, in the order of `EvidenceStage.offsets`."""
 
+ALONE_LOG_ODDS = 2.5
+"""Added to ln of the odds of a hand's only contact: nothing else holds the object there."""
+
 _COUNT, _WINDOWS, _LINK_WINDOWS, _HAND_WINDOWS = len(SLIP_FEATURES), 4, 3, 2
 _LOG_RATIO, _SLIPPING, _SPEED, _ONSET_AGE, _FORCE_RATE = 0, 1, 2, 3, 4
 _CURRENT_CHANGE = 5
@@ -79,7 +83,7 @@ _VELOCITY_WINDOW, _MAX_AGE_NS = 2, 50_000_000
 _MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
 _MAX_HOLDING_LOG_RATIO = 3.0  # ln R of a contact that counts as sticking to the object
 _UPDATE_NS = 4_500_000
-_ALONE_LOG_ODDS = 2.5  # added for a hand's only contact: nothing holds the object against slipping there
+_ALONE_LOG_ODDS = ALONE_LOG_ODDS
 _MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
 _MIN_PATH_M, _MIN_CURRENT_VARIANCE = 1e-8, 1e-6
 _MIN_PIVOT = 1e-6  # information is that of the prior at least, 1e3 and more
