@@ -322,8 +322,9 @@ def main() -> None:
             touches=len(false),
             fingers=asked.paired,
         )
-        page += table(f"Two contacts at once in `{world}`", text, pair_rows(pairs))
-        record[f"{world}, pairs"] = [asdict(pair) for pair in pairs]
+        rows = pair_rows(pairs)
+        page += table(f"Two contacts at once in `{world}`", text, rows)
+        record[f"{world}, pairs"] = rows
         record[f"{world}, touches reported as two"] = [int(false.sum()), len(false)]
     starts = range(0, asked.linear, LINEAR_PER_TASK)
     singles, pairs = [], []
@@ -333,13 +334,14 @@ def main() -> None:
             singles += some
             pairs += more
     text = LINEAR_TEXT.format(pads=asked.linear, contacts=LINEAR[0], pairs=LINEAR[1])
-    page += table("Many pads in `default`", text, linear_rows(singles))
+    contacts = linear_rows(singles)
+    page += table("Many pads in `default`", text, contacts)
     rows = [
         {name: value for name, value in row.items() if "force" not in name and ", N" not in name}
         for row in pair_rows(pairs)
     ]
     page += table("Two contacts at once on many pads in `default`", LINEAR_PAIRS, rows)
-    record["many pads"] = {"contacts": singles, "pairs": [asdict(pair) for pair in pairs]}
+    record["many pads"] = {"contacts": contacts, "pairs": rows}
     out = output_folder(asked.quick)
     (out / "electrodes.md").write_text("\n".join(page))
     (out / "electrodes.json").write_text(json.dumps(record, indent=1).replace("NaN", "null") + "\n")
