@@ -11,10 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from handtouch.config import parse
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field import estimate
 from handtouch.field.contact_law import ForceEstimateStatus
+from tests.deployments import deployment_text, pad_text
 
 FloatArray = NDArray[np.float64]
 PADS = np.arange(3)
@@ -245,3 +247,15 @@ def test_a_point_contact_has_the_covariance_of_its_noise(bench: Any) -> None:
         ]
         equal.extend(sizes[0] < 1.05 * sizes[1])
     assert 0.98 < np.mean(equal) <= 1.0
+
+
+def test_contacts_on_a_pad_whose_electrodes_touch_are_located() -> None:
+    model = PadModel(parse(deployment_text(pad_text("link", 1, gap_mm=0.0))))
+    (network,) = model.networks
+    at = np.array([0.3, 0.6]) * (network.a, network.b)
+    values = np.full((1, VALUE_COUNT), np.nan)
+    currents = 2e-3 * network.fractions(*at)[None]
+    make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(np.arange(1).data)
+    np.testing.assert_allclose(values[0, VALUE_SLICES["xy"]], at, atol=1e-6)
+    covariance = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)
+    assert 0 < np.trace(covariance) < 1e-6

@@ -92,7 +92,10 @@ class GroundedElectrodes(ABC):
     def series_sensitivity(self) -> FloatArray:
         """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f by S[:, j] f[j]."""
         drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
-        return -self._mix @ self.conductance * np.where(np.isfinite(drop), drop, 0.0)
+        drop = np.where(np.isfinite(drop), drop, 0.0)
+        if not drop.any():  # of electrodes that touch, the conductance is infinite
+            return np.zeros_like(self._mix)
+        return -self._mix @ self.conductance * drop
 
     @property
     def currents_per_ideal(self) -> FloatArray:
