@@ -49,6 +49,7 @@ class ManagedNode:
     tpdo_numbers: tuple[int, ...]
     sdo: SdoTransport
     lifecycle: Lifecycle = field(default_factory=Lifecycle)
+    excused_ns: int = 0  # sum of the loop's pauses that its timeouts include
     identity: boot.Identity | None = None
     mapping: PdoMapping | None = None
     sdo_lock: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time

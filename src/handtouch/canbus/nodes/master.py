@@ -137,6 +137,7 @@ class Master:
         self._bus_causes = BusCauses(ports, self._nodes, sync_period_ns or 0)
         self._awaited_samples: dict[int, int] = {}  # slot -> arrival of its last sample
         self._next_due_ns = 0
+        self._excused_ns = 0  # sum of all pauses
         self._sample_rates = SampleRates(self._slab, ports, self._nodes, sync_period_ns or 0)
         self._recovered_ns = {name: port.bus_state.recovered_ns for name, port in ports.items()}
         self._events: deque[MasterEvent] = deque(maxlen=_MAX_EVENTS)
@@ -172,13 +173,15 @@ class Master:
             self._collect_results(now_ns)
 
     def excuse_pause(self, excused_ns: int, now_ns: int) -> None:
-        """Extend all timeouts by a pause of the loop or the whole host; before its frames are handled."""
+        """Extend all timeouts by a pause of the loop or the whole host; before its frames are handled.
+
+        It costs the same for any number of nodes, as each takes over its pauses when it is next handled: a
+        loop that can't keep up must not be delayed by excuses for it.
+        """
         reference_ns = np.maximum(self._slab.arrival_ns, self.transmission_since_ns)
         np.add(reference_ns, excused_ns, out=self.transmission_since_ns)
         self._bus_causes.record_pause(excused_ns + self._sync_period_ns, now_ns)
-        for node in self._nodes:
-            self._advance(node, LoopPaused(excused_ns), now_ns)
-        self._next_due_ns = now_ns
+        self._excused_ns += excused_ns
 
     def poll(self, now_ns: int) -> None:
         """Run timeouts and retries and collect the workers' results; once a tick, after `handle_frame`.
@@ -298,6 +301,7 @@ class Master:
             self._advance(node, BootUpReceived(), now_ns)
             return
         node.heartbeats += 1
+        self._take_over_pauses(node, now_ns)
         self._check_heartbeat_rate(node, now_ns)
         if node.lifecycle.last_heartbeat_ns is not None:
             node.missed_heartbeats += max(
@@ -352,6 +356,7 @@ class Master:
     def _run_timers(self, now_ns: int) -> None:
         self._next_due_ns = _NEVER_NS
         for node in self._nodes:
+            self._take_over_pauses(node, now_ns)
             due = due_ns(node.lifecycle, node.timing)
             if due is not None and due <= now_ns:
                 causes, ages_ns = self._bus_causes, self._sample_ages_ns(now_ns)
@@ -370,7 +375,15 @@ class Master:
             node.port.send(cia301.NMT_ERROR_CONTROL + node.spec.node_id, b"", remote=True)
             node.next_guard_ns = now_ns + node.timing.heartbeat_period_ns
 
+    def _take_over_pauses(self, node: ManagedNode, now_ns: int) -> None:
+        """Extend a node's timeouts by the pauses since it was last handled."""
+        if node.excused_ns != self._excused_ns:
+            pause = LoopPaused(self._excused_ns - node.excused_ns)
+            node.lifecycle, _ = advance(node.lifecycle, pause, now_ns, node.timing)
+            node.excused_ns = self._excused_ns
+
     def _advance(self, node: ManagedNode, event: LifecycleEvent, now_ns: int) -> None:
+        self._take_over_pauses(node, now_ns)
         before = node.lifecycle
         node.lifecycle, actions = advance(before, event, now_ns, node.timing)
         after = node.lifecycle
