@@ -186,14 +186,11 @@ def play_linear(numbers: range, touches: int, pairs: int) -> tuple[list[tuple[in
     low, high = np.log(LINEAR_TOTALS_A)
     for number in numbers:
         drawn = drawn_world("default", number)
-        deviations, gains = pads.deviations(drawn)
         rng = np.random.default_rng((drawn.seed, 7))
         s, t = rng.uniform(0.05, 0.95, (2, touches + pairs, 2))
         totals = np.exp(rng.uniform(low, high, (touches + pairs, 2)))
         totals[:touches, 1] = 0.0
-        fractions = np.tensordot(np.append(1.0, deviations), pads.fractions(s, t), 1)
-        currents = gains[:, None] * (fractions * totals).sum(axis=-1)
-        currents += pads.noise_a[:, None] * rng.normal(size=currents.shape)
+        currents = pads.draw_currents(drawn, s, t, totals, rng)
         true_m = pads.position_m(s, t)
         for k, sample in enumerate(currents.T):
             position_m, covariance_m2, parts = pads.solve(sample)

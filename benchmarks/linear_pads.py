@@ -72,6 +72,16 @@ class LinearPads:
             changed.append(network.fractions(s * a, t * b) - nominal)
         return np.array([nominal, *changed])
 
+    def draw_currents(
+        self, drawn: DrawnWorld, s: FloatArray, t: FloatArray, totals_a: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Return noisy currents (n, k) of a drawn pad under k samples of contacts with these totals, at these
+        positions, each (k, contacts)."""
+        deviations, gains = self.deviations(drawn)
+        fractions = np.tensordot(np.append(1.0, deviations), self.fractions(s, t), 1)
+        currents = gains[:, None] * (fractions * totals_a).sum(axis=-1)
+        return np.asarray(currents + self.noise_a[:, None] * rng.normal(size=currents.shape))
+
     def position_m(self, s: FloatArray, t: FloatArray) -> FloatArray:
         """Return positions (..., 3) in the pad's frame, which is the link's for a pad without a mount."""
         return np.moveaxis(self._surface.point(s * self._network.a, t * self._network.b), 0, -1)

@@ -65,14 +65,11 @@ def test_single_contacts_and_pairs_on_many_drawn_pads_are_in_their_regions_as_st
     """Of 95 %. All contacts of one pad are moved by the same parts, so that few pads show little."""
     singles, pairs, rng = [], [], np.random.default_rng(8)
     for number in range(120):
-        deviations, gains = pads.deviations(drawn(number))
         s, t = rng.uniform(0.1, 0.9, (2, 4, 2))
         s[2:, 0], s[2:, 1] = rng.uniform(0.1, 0.35, 2), rng.uniform(0.65, 0.9, 2)
         totals = np.exp(rng.uniform(np.log(6e-4), np.log(2.5e-3), (4, 2)))
         totals[:2, 1] = 0.0
-        fractions = np.tensordot(np.append(1.0, deviations), pads.fractions(s, t), 1)
-        currents = gains[:, None] * (fractions * totals).sum(axis=-1)
-        currents += pads.noise_a[:, None] * rng.normal(size=currents.shape)
+        currents = pads.draw_currents(drawn(number), s, t, totals, rng)
         true_m = pads.position_m(s, t)
         for k, sample in enumerate(currents.T):
             position_m, covariance_m2, parts = pads.solve(sample)

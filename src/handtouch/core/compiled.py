@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 STAGES = (
     *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
-    *("publish", "kinematics", "frames", "groups", "shear", "evidence"),
+    *("kinematics", "frames", "publish", "groups", "shear", "evidence"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 DIRECTIVES = {

@@ -138,8 +138,7 @@ class ForwardTable:
         model: the pad's network. The others collect its current in constant proportions; how these vary with
         the tolerances of parts is neglected.
         """
-        series = [math.inf if k == electrode else ohm for k, ohm in enumerate(model.series_ohm)]
-        floating = model.with_series_ohm(series)
+        floating = model.with_open_electrode(electrode)
         mixing = floating.currents_per_ideal @ np.linalg.inv(model.currents_per_ideal)
         n = self.electrodes
         nodes, tolerances = self.nodes.copy(), self.tolerance_nodes.copy()

@@ -58,6 +58,12 @@ class GroundedElectrodes(ABC):
         network._set_series_resistors(series_ohm)
         return network
 
+    def with_open_electrode(self, electrode: int) -> Self:
+        """Return the same pad with one electrode connected to nothing; costs microseconds."""
+        series = list(self.series_ohm)
+        series[electrode] = np.inf
+        return self.with_series_ohm(series)
+
     @np.errstate(all="ignore")
     def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the measured fractions of the contact's current, resistors included; (m, ...), summing to

@@ -51,9 +51,8 @@ class RelativeMotion:
             std,
             "grasp" if others else "static",
             others,
-            _sigmoid(
-                (log_ratio if others else max(log_ratio, 0.0)) + _SLIDING_LOG_ODDS
-            ),  # a static object is only an assumption
+            # that the object is static is only an assumption
+            _sigmoid((log_ratio if others else max(log_ratio, 0.0)) + _SLIDING_LOG_ODDS),
             _sigmoid(log_ratio + _SLIDING_AT_REST_LOG_ODDS) if others else 0.0,
         )
 

@@ -75,10 +75,8 @@ def flatten_payload(payload: dict[str, Any]) -> Row:
         if name == _PARTS:
             row |= _part_columns(value)
             continue
-        length = _VECTOR_LENGTHS.get(name)
-        if length is not None:
-            parts = value if value is not None else [None] * length
-            row |= dict(zip(component_names(name, length), parts, strict=True))
+        if name in _VECTOR_LENGTHS:
+            row |= _component_columns(name, value)
         elif isinstance(value, list):
             row[name] = "; ".join(map(_item_text, value))
         elif isinstance(value, _SCALAR_TYPES):
@@ -91,14 +89,17 @@ def _part_columns(parts: Sequence[Mapping[str, Any]]) -> Row:
     row: Row = {}
     for number in range(_MAX_PARTS):
         part = parts[number] if number < len(parts) else {}
-        values = {f"part_{number + 1}_{name}": part.get(name) for name in _PART_COLUMNS}
-        for name, value in values.items():
-            length = _VECTOR_LENGTHS.get(name.split("_", 2)[2])
-            if length is None:
-                row[name] = value
-                continue
-            row |= dict(zip(component_names(name, length), value or [None] * length, strict=True))
+        for name in _PART_COLUMNS:
+            value = part.get(name)
+            columns = _component_columns(name, value) if name in _VECTOR_LENGTHS else {name: value}
+            row |= {f"part_{number + 1}_{column}": one for column, one in columns.items()}
     return row
+
+
+def _component_columns(name: str, values: Sequence[Any] | None) -> Row:
+    """Return a column per component of a field that is a vector, empty ones for None."""
+    columns = component_names(name, _VECTOR_LENGTHS[name])
+    return dict.fromkeys(columns) if values is None else dict(zip(columns, values, strict=True))
 
 
 def _item_text(item: Any) -> str:

@@ -29,7 +29,6 @@ cdef class EvidenceStage:
                    row=Py_ssize_t, i=Py_ssize_t)
     cpdef bint compare_to_object(self, Py_ssize_t pad, double[::1] out)
     cpdef compute_features(self, Py_ssize_t[::1] pads)
-    cpdef double sum_trees(self, Py_ssize_t pad)
 
 @cython.locals(at=Py_ssize_t)
 cdef bint _is_placed(EvidenceStage stage, Py_ssize_t pad) noexcept

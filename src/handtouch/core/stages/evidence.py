@@ -217,10 +217,6 @@ class EvidenceStage:
         """Compute the features of the contacts on these pads alone."""
         _compute_features(self, pads, len(pads))
 
-    def sum_trees(self, pad: int) -> float:
-        """Return ln of the odds of slip by the features of a pad."""
-        return _sum_trees(self, pad)
-
 
 def _is_placed(stage: EvidenceStage, pad: int) -> bool:
     """Return True if the pose of the link under a contact is known."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from handtouch.core.stages.frames import FRAME_VALUES, PART_FRAMES
 from handtouch.core.stages.solve import (
     MAX_SQUARED_MISFIT,
     PART_COUNT,
@@ -47,15 +48,15 @@ WRITTEN_FIELDS = (
     *("force_vector_covariance_n2", "palm_force_vector_n", "base_force_vector_n", "parts"),
 )
 """Fields in the order in which they are written; the others are texts of the pad."""
-_PALM_VALUES, _PAD_M = 31, VALUE_SLICES["pad_m"].start
+_PALM_VALUES, _PAD_M = 2 * FRAME_VALUES + 1, VALUE_SLICES["pad_m"].start
 _NORMAL, _COVARIANCE = VALUE_SLICES["normal"].start, VALUE_SLICES["covariance_m2"].start
 _RESIDUAL, _RESIDUAL_STD = VALUE_SLICES["residual"].start, VALUE_SLICES["residual_std"].start
-_BASE, _AGE = 15, 30  # in the values of a contact in palm and base
+_BASE, _AGE = FRAME_VALUES, 2 * FRAME_VALUES  # in the values of a contact in palm and base
 _VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
 _END = 2  # number of the event
 _PART_COUNT, _PARTS_COUNT, _PART_COVARIANCE = PART_COUNT, PARTS_COUNT, PART_SLICES["covariance_m2"].start
 _PART_FORCE = PART_SLICES["force_n"].start
-_PART_FRAMES = 60  # two contacts in palm and base, `frames.PART_FRAMES`
+_PART_FRAMES = PART_FRAMES
 _KEY_POSITION, _KEY_NORMAL = WRITTEN_FIELDS.index("position_m"), WRITTEN_FIELDS.index("normal")
 _KEY_COVARIANCE, _KEY_FORCE = WRITTEN_FIELDS.index("covariance_m2"), WRITTEN_FIELDS.index("force_n")
 _KEY_FORCE_STD, _KEY_PARTS = WRITTEN_FIELDS.index("force_std_n"), WRITTEN_FIELDS.index("parts")

@@ -101,11 +101,12 @@ class ChannelFaultDetector:
         self._repeats_since_ns = np.where(begins, t_ns, self._repeats_since_ns)
         self._repeats = np.where(features.varied, 0, self._repeats) + features.trailing_repeats
         at_end = features.railed_fraction >= 1.0
-        railed = at_end | (features.mean_counts.min(axis=0) > _MIN_SHORT_FRACTION * self._short_counts)
+        lowest = features.mean_counts.min(axis=0)
+        railed = at_end | (lowest > _MIN_SHORT_FRACTION * self._short_counts)
         self._railed_since_ns = np.where(
             railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
         )
-        least = features.mean_counts.min(axis=0)[:, None, :]
+        least = lowest[:, None, :]
         aged = (t_ns // _MIN_WINDOW_NS) != (self._last_ns // _MIN_WINDOW_NS)  # (n, 1)
         recent = np.where(aged[:, :, None], self._recent_min_counts, self._min_counts)
         self._recent_min_counts = np.where(
@@ -139,11 +140,11 @@ class ChannelFaultDetector:
         """Return whether a fault keeps its kind: it does beside a short, whose current is in all channels."""
         if before.kind == FaultKind.SHORTED_ELECTRODE:
             return True
-        others = {other: fault for (row, other), fault in self.faults.items() if row == pad}
-        del others[channel]
         unknown = (self._railed_since_ns[pad] >= 0) & ~self.faulty_channels[pad]
         return bool(unknown.any()) or any(
-            fault.kind == FaultKind.SHORTED_ELECTRODE for fault in others.values()
+            fault.kind == FaultKind.SHORTED_ELECTRODE
+            for (row, other), fault in self.faults.items()
+            if row == pad and other != channel
         )
 
     def _classify(self, pad: int, channel: int, features: BlockFeatures) -> ChannelFault | None:

@@ -168,11 +168,8 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
         cause = "contacts on the pad never look like a point contact, and no known fault explains them"
         remedy = "inspect the pad; if several objects touch it at a time, that is the reason"
     elif hypothesis.kind == FaultKind.DEAD_ELECTRODE:
-        cause = f"electrode {names[0]} carries no current: its wire is broken or unplugged"
-        remedy = "check the wire and the socket of that electrode"
-        if len(model.electrodes[pad]) >= _MIN_CHANNELS_WITH_DEAD:
-            remedy += "; until then, contacts are located with the others"
-            position_valid = force_valid = True
+        cause, remedy, is_located = _describe_dead_electrode(model, pad, names[0])
+        position_valid = force_valid = is_located
     elif hypothesis.kind == FaultKind.SHORTED_ELECTRODE:
         cause = f"electrodes {names[0]} and {names[1]} are shorted to one another"
         remedy = "check where their wires or the two ends of the electrodes meet"
@@ -215,12 +212,10 @@ def describe_contact_fault(model: DiagnosisModel, pad: int, fault: ContactFault)
 def describe_loose_electrode(model: DiagnosisModel, pad: int, loose: LooseElectrode) -> PadDiagnosis:
     """Return the diagnosis of an electrode that opened: `dead_electrode`, always or part of the time."""
     name, values = model.electrodes[pad][loose.channel], loose.evidence
-    is_located = loose.is_dead and len(model.electrodes[pad]) >= _MIN_CHANNELS_WITH_DEAD
+    is_located = False
     if loose.is_dead:
         values["contacts"] = float(loose.contacts)
-        cause = f"electrode {name} carries no current: its wire is broken or unplugged"
-        remedy = "check the wire and the socket of that electrode"
-        remedy += "; until then, contacts are located with the others" if is_located else ""
+        cause, remedy, is_located = _describe_dead_electrode(model, pad, name)
     else:
         cause = (
             f"electrode {name} is open part of the time: under contacts, its current stops and returns from "
@@ -241,6 +236,14 @@ def describe_loose_electrode(model: DiagnosisModel, pad: int, loose: LooseElectr
         force_valid=is_located,
     )
     return PadDiagnosis(published, model.links[pad], values, (name,))
+
+
+def _describe_dead_electrode(model: DiagnosisModel, pad: int, name: str) -> tuple[str, str, bool]:
+    """Return cause and remedy, and whether contacts are located with the other electrodes."""
+    is_located = len(model.electrodes[pad]) >= _MIN_CHANNELS_WITH_DEAD
+    remedy = "check the wire and the socket of that electrode"
+    remedy += "; until then, contacts are located with the others" if is_located else ""
+    return f"electrode {name} carries no current: its wire is broken or unplugged", remedy, is_located
 
 
 def _evidence_text(values: Mapping[str, float]) -> str:

@@ -65,7 +65,7 @@ class HandDiagnostics:
         offsets = model.offset_counts if offset_counts is None else offset_counts
         self._offsets = np.asarray(offsets, np.float64)
         n = len(model.links)
-        noise = np.hypot(model.noise_counts, 12**-0.5)
+        noise = model.reading_noise_counts
         self._channels = ChannelFaultDetector(model)
         self._offset_steps = OffsetStepDetector(model)
         self._loose = LooseElectrodeDetector(model)
@@ -245,10 +245,7 @@ def _is_sliding(excess: FloatArray, at: int, position: FloatArray, weights: Floa
 
 
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:
-    if (before.kind, before.published.cause) != (
-        now.kind,
-        now.published.cause,
-    ) and now.kind == FaultKind.DEAD_ELECTRODE:
+    if now.kind == FaultKind.DEAD_ELECTRODE and before.published.cause != now.published.cause:
         return True  # dead now, or part of the time only
     change = abs(now.published.confidence - before.published.confidence)
     return before.electrodes != now.electrodes or change > _MIN_CONFIDENCE_CHANGE

@@ -121,9 +121,8 @@ class HypothesisTables:
         self._nominal = _FractionTable(nominal[None])
         others = []
         for channel in range(c):
-            floating = network.with_series_ohm(np.where(np.arange(c) == channel, np.inf, series).tolist())
             self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (electrodes[channel],)))
-            others.append(floating.fractions(x, y).T)
+            others.append(network.with_open_electrode(channel).fractions(x, y).T)
         if series.any():
             for i, j in itertools.combinations(range(c), 2):
                 merged = nominal.copy()

@@ -89,7 +89,7 @@ class LooseElectrodeDetector:
 
     def __init__(self, model: DiagnosisModel) -> None:
         self._model = model
-        self._noise = np.hypot(model.noise_counts, 12**-0.5)
+        self._noise = model.reading_noise_counts
         self._taken_over: dict[Hashable, FloatArray] = {}
         self._candidates: dict[tuple[int, int], LooseElectrode] = {}
         self._last: tuple[NDArray[np.int64], FloatArray, NDArray[np.bool_]] | None = None
@@ -163,14 +163,10 @@ class LooseElectrodeDetector:
         design = self._model.designs[pad]
         if design not in self._taken_over:
             network = self._model.networks[pad]
-            series = np.array(network.series_ohm)
-            open_one = [
-                np.where(np.arange(len(series)) == k, np.inf, series).tolist() for k in range(len(series))
-            ]
             self._taken_over[design] = np.array(
                 [
-                    network.with_series_ohm(ohm).fractions(*centre)
-                    for ohm, centre in zip(open_one, network.centres, strict=True)
+                    network.with_open_electrode(k).fractions(*centre)
+                    for k, centre in enumerate(network.centres)
                 ]
             )
         return self._taken_over[design]

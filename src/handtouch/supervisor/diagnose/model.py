@@ -89,6 +89,11 @@ class DiagnosisModel:
     offset_counts: FloatArray
     gain_covariance: FloatArray
 
+    @property
+    def reading_noise_counts(self) -> FloatArray:
+        """Noise (n,) of a reading, that of its rounding included."""
+        return np.asarray(np.hypot(self.noise_counts, 12**-0.5))
+
     @classmethod
     def from_deployment(cls, deployment: config.Deployment, hand: str) -> DiagnosisModel:
         """Build the model of a hand from its deployment. Raises KeyError for an unknown hand."""

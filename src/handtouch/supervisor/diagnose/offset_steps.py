@@ -49,7 +49,7 @@ class OffsetStepDetector:
     """Detector of offsets of the n pads of a hand; `steps` by row of the pad and channel."""
 
     def __init__(self, model: DiagnosisModel) -> None:
-        self._noise = np.hypot(model.noise_counts, 12**-0.5)
+        self._noise = model.reading_noise_counts
         self._candidates: dict[tuple[int, int], _Candidate] = {}
         self._last: tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.int64]] | None = None
         self._shape = model.ampere_per_count.shape
