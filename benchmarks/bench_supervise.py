@@ -21,7 +21,19 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 from page import made_by, options, output_folder, progress
-from scores import ClusterShare, Estimates, EstimateScore, Share, concatenate, slices
+from scores import Estimates, EstimateScore, Share, concatenate, slices
+from sheet_hours import (
+    COMPLETE,
+    CUTS,
+    PADS,
+    SEEDS,
+    UNLEARNED,
+    force_row,
+    kinds_of,
+    of_kinds,
+    rms,
+    used,
+)
 from sheet_use import FULL_N, HOUR_S, Holds, drawn_sheets, score_use
 
 from handtouch.config import Behaviour, load, shipped
@@ -30,7 +42,7 @@ from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
 from handtouch.simulate.electronics_drift import ElectronicsDrift
-from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, Family, SheetKind
+from handtouch.simulate.worlds import WORLDS, Family
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -41,8 +53,6 @@ PERIOD_NS = 100_000_000
 DRIFTS = {name: world.only("electronics").draw(Family.REPORTING.seed(71)) for name, world in WORLDS.items()}
 SPAN_S = 60.0  # of drift that is drawn at once
 HELD = 5  # pads
-PADS, SEEDS = 8, (31, 32)
-"""Sheets of each kind, and seeds of worlds and use."""
 HOLDS = (1, 2, 4, 8)
 """Numbers of the holds that are compared on sheets that weren't measured."""
 DAY, PARTS = "Mixed use of sheets", "Effect of the parts"
@@ -281,31 +291,6 @@ def slow(quick: bool) -> Rows:
 # Hours on sheets
 
 
-CUTS: dict[str, dict[str, Any]] = {
-    "no adaptation compensation": {"adaptation_share": 0.0},
-    "no creep compensation": {"creep_share": 0.0},
-    "no parameter uncertainty": {"parameter_std_fraction": 0.0},
-}
-"""Changes of what the deployment file states."""
-COMPLETE, UNLEARNED = "", "nothing learned"
-PAPER = ("S1", "S2")
-
-
-def kinds_of(world: str) -> tuple[SheetKind, ...]:
-    """Return the kinds of sheets that are measured in a world, those of the paper among them."""
-    kinds = () if world == "harsh" else tuple(SHEET_KINDS[name] for name in PAPER)
-    return (*WORLDS[world].sheets.kinds(Family.REPORTING), *kinds)
-
-
-def used(world: str, part: str, hours: float, seed: int, pads: int) -> Estimates:
-    """Return force errors of all kinds of sheets of a world, with a part of the compensation left out."""
-    drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
-    sheets = [drawn_sheets(drawn, kind, pads) for kind in kinds_of(world)]
-    if part in CUTS:
-        sheets = [replace(some, behaviour=some.behaviour.model_copy(update=CUTS[part])) for some in sheets]
-    return score_use([replace(some, learns=part != UNLEARNED) for some in sheets], hours, drawn.seed)
-
-
 def unmeasured(seed: int, pads: int) -> Estimates:
     """Return force errors of one object held again and again; all sheets are stated as unknown."""
     drawn = WORLDS["default"].draw(Family.REPORTING.seed(seed))
@@ -337,36 +322,6 @@ def unknown_rows(every: Estimates) -> Rows:
                 }
             )
     return rows
-
-
-def of_kinds(world: str, every: Estimates) -> Estimates:
-    """Return the rows of the world's own kinds."""
-    own = [kind.name for kind in WORLDS[world].sheets.kinds(Family.REPORTING)]
-    return every.where(np.isin(every.columns["kind"], own or PAPER))
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
-
-
-def force_row(some: Estimates, **names: str) -> dict[str, Any]:
-    """Return a row of a table: forces with and without compensation."""
-    good = some.where(some.valid)
-    inside = good.distances() <= 1.96
-    raw, error = rms(good.columns["uncompensated"]), rms(good.error)
-    pads = good.columns["pad"]
-    return {
-        **names,
-        "touches": len(some),
-        "pads": len(np.unique(some.columns["pad"])),
-        "uncompensated, N": raw,
-        "compensated, N": error,
-        "ratio": f"{error / raw:.2f}",
-        "in 95 %": str(Share.of_mask(inside)),
-        "by pad": str(ClusterShare.of_mask(inside, pads)) if len(np.unique(pads)) > 1 else "-",
-        "median width, N": 2 * 1.96 * float(np.median(np.sqrt(good.covariance))) if len(good) else math.nan,
-        "valid, %": f"{100 * some.valid.mean():.1f}" if len(some) else "-",
-    }
 
 
 def by_hour(some: Estimates) -> list[list[float]]:

@@ -20,8 +20,9 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from bench_supervise import COMPLETE, FULL_N, PADS, SEEDS, UNLEARNED, force_row, of_kinds, rms, used
 from scores import Estimates, EstimateScore, concatenate, slices
+from sheet_hours import COMPLETE, PADS, SEEDS, UNLEARNED, force_row, of_kinds, rms, used
+from sheet_use import FULL_N
 
 PARTS = (("default", COMPLETE), ("default", UNLEARNED), ("harsh", COMPLETE))
 PART_OF_DAY_H = 6.0
