@@ -2,8 +2,8 @@
 
 Episodes of a small hand in use, with and without a fault, on hands drawn for the reporting family. Prints its
 tables and writes docs/benchmarks/diagnose.{md,json,png}. `--quick` plays one episode of each name;
-`--episodes N` says how many of each in each world; `--journal FILE` keeps what was played: an interrupted run
-continues from it.
+`--episodes N` says how many of each fault in each world; `--journal FILE` keeps what was played: an
+interrupted run continues from it.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 NAMES = (*FAULTY, *FAULT_FREE)
+FAULT_FREE_SHARE = 0.4
+"""Episodes of each use without a fault, of those of each fault: soak_alarms plays hours of it."""
 NOTHING = "nothing"
 FIRST_SEED = 2000
 """Of the use that is played; thresholds were tuned on seeds below 1100."""
@@ -87,6 +89,11 @@ def is_right(it: Episode, truth: str, found: Detected) -> bool:
     return kind == truth and link == it.link and at_s >= it.begin_s
 
 
+def fault_free_count(count: int) -> int:
+    """Return the number of episodes of each use without a fault, for `count` of each fault."""
+    return max(1, round(FAULT_FREE_SHARE * count))
+
+
 def run(count: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
     """Play all episodes, seed by seed; results in a journal aren't computed again."""
     lines = journal.read_text().splitlines() if journal and journal.exists() else []
@@ -95,6 +102,7 @@ def run(count: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
         for seed in range(FIRST_SEED, FIRST_SEED + count)
         for world in WORLDS
         for name in NAMES
+        if name in FAULTY or seed < FIRST_SEED + fault_free_count(count)
     ]
     requested = {*every}
     found = [r for r in map(json.loads, lines) if (r["world"], r["name"], r["seed"]) in requested]
@@ -219,18 +227,18 @@ NOTE = (
     "with 95 % intervals (Clopper and Pearson, Poisson)."
 )
 HEAD = """\
-{count} episodes of each name in each [world](../worlds.md), {length:g} s on three pads of the shipped
-hand at 100 Hz: {hands} hands of each world, seeds of the reporting family, another one every {share}
-episodes. One pad has a fault while all are in use. An episode ends {settled:g} s after its fault was
-named, if there was no wrong diagnosis. The deployment file describes sheets as their builder would; all
-that the world draws is hidden from the diagnosis. Left out as not observable: cables of opposite
-electrodes swapped, which mirrors the pad, and short circuits between electrodes without series resistors.
-Hours of a healthy hand are in [alarms](alarms.md)."""
+{count} episodes of each fault in each [world](../worlds.md) and {fault_free} of each use without one,
+{length:g} s on three pads of the shipped hand at 100 Hz: {hands} hands of each world, seeds of the reporting
+family, another one every {share} episodes. One pad has a fault while all are in use. An episode ends
+{settled:g} s after its fault was named, if there was no wrong diagnosis. The deployment file describes sheets
+as their builder would; all that the world draws is hidden from the diagnosis. Left out as not observable:
+cables of opposite electrodes swapped, which mirrors the pad, and short circuits between electrodes without
+series resistors. Hours of a healthy hand are in [alarms](alarms.md)."""
 
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--episodes", type=int, default=25, help="of each name in each world")
+    parser.add_argument("--episodes", type=int, default=25, help="of each fault in each world")
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--journal", type=Path, help="file to keep results in")
     asked = parser.parse_args()
@@ -262,6 +270,7 @@ def main() -> None:
     )
     head = HEAD.format(
         count=count,
+        fault_free=fault_free_count(count),
         length=LENGTH_S,
         settled=SETTLED_S,
         hands=len({hand_of(r["seed"]) for r in results}),

@@ -24,9 +24,20 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_cases import CASES, HAND_EPISODES, MENDED_S, SERIES_OHM, SETTLED_S, hides, matches, play_case
+from diagnose_cases import (
+    CASES,
+    DRYING_S,
+    HAND_EPISODES,
+    MENDED_S,
+    SERIES_OHM,
+    SETTLED_S,
+    hides,
+    matches,
+    play_case,
+)
 from scores import Share, score_events
 
+from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS
 from handtouch.wire.faults import FaultKind
 
 matplotlib.use("Agg")
@@ -253,7 +264,9 @@ NOTES = {
     "opposite electrodes of pads with series resistors. Both read the same there, which is no evidence that "
     "they are shorted.",
     "Mended faults": f"Faults that end {MENDED_S:g} s after they began, in use for up to 6 more minutes. "
-    "Those of single channels and static loads end by themselves, those of contacts after 20 of them.",
+    "Those of single channels and static loads end by themselves, those of contacts after 20 of them. "
+    f"Moisture dries, with a time constant of {DRYING_S:g} s: its diagnosis ends when its leak is below "
+    f"{MIN_LOAD_COUNTS:g} counts.",
     "Reliability of the stated confidence": "All diagnoses above, `unexplained` aside; right: a fault that "
     "was played, on its pad, after it began.",
 }
@@ -263,7 +276,7 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument(
-        "--share", type=float, default=1.0, help="of the episodes that are played (default: 1)"
+        "--share", type=float, default=0.5, help="of the episodes that are played (default: 0.5)"
     )
     parser.add_argument("--journal", type=Path, help="file to keep results in")
     asked = parser.parse_args()

@@ -26,13 +26,13 @@ from handtouch.wire.faults import FaultKind
 
 MENDED_S = 100.0
 """Time from the begin of a fault that is mended to its end."""
+DRYING_S = 40.0
+"""Time constant with which moisture dries after its end."""
 SETTLED_S = 15.0
 """Time from when all faults are named, and the mended ones have ended, to the end of an episode."""
 SERIES_OHM = (100.0, 1000.0)
 HAND_EPISODES = 4
 """Episodes that share a drawn hand."""
-BLOCKS_AT_ONCE = 20
-"""Blocks of samples that are computed together: an episode may end early."""
 _TABLES: dict[Any, Any] = {}
 PLAYED = tuple(name for name in FAULTY if name != "hysteresis tail")
 """Faults that are drawn; a tail is a use of a healthy pad."""
@@ -125,6 +125,7 @@ def _draw_faults(
         keys |= {"link": links[number], "from_s": begin_s + 10.0 * number}
         if case.is_mended:
             keys["until_s"] = begin_s + MENDED_S
+            keys |= {"dry_s": DRYING_S} if one == "moisture" else {}
         drawn.append((one, keys))
     return drawn
 
@@ -205,7 +206,7 @@ def play_case(task: tuple[int, str, int]) -> dict[str, Any]:
     diagnosis = HandDiagnostics(model, tables=_TABLES)
     found: list[dict[str, Any]] = []
     t_s, quiet_since_s = 0.0, None
-    for block in sample_blocks(virtual, case.length_s, BLOCKS_AT_ONCE):
+    for block in sample_blocks(virtual, case.length_s):
         t_s = float(block.sample_ns.max()) * 1e-9
         for it in diagnosis.process_block(block):
             if not it.is_fault:

@@ -23,6 +23,8 @@ from handtouch.wire.faults import FaultKind
 PADS = ("index_distal", "index_proximal", "palm_thumb")
 RATE_HZ = 100
 BLOCK = 50  # samples
+BLOCKS_AT_ONCE = 20
+"""Blocks of samples that are computed together: an episode may end early."""
 LENGTH_S = 110.0
 ELECTRODES = ("x0", "xa", "y0", "yb")
 FAULTY = {
@@ -62,13 +64,11 @@ class Episode:
         return sample_blocks(self.hand, length_s)
 
 
-def sample_blocks(
-    hand: VirtualHand, length_s: float, blocks_at_once: int | None = None
-) -> Iterator[HandSamples]:
-    """Yield the samples of a hand in blocks; blocks_at_once: computed in one call, by default all."""
+def sample_blocks(hand: VirtualHand, length_s: float) -> Iterator[HandSamples]:
+    """Yield the samples of a hand in blocks."""
     ticks = int(length_s * RATE_HZ) // BLOCK * BLOCK
     fresh = np.ones((BLOCK, len(PADS)), dtype=np.bool_)
-    some = ticks if blocks_at_once is None else blocks_at_once * BLOCK
+    some = BLOCKS_AT_ONCE * BLOCK
     for start in range(0, ticks, some):
         times = np.arange(start, min(start + some, ticks)) / RATE_HZ
         counts = np.stack([hand.counts(row, times) for row in range(len(PADS))], axis=1)

@@ -26,7 +26,7 @@ from handtouch.supervisor.diagnose import (
 from handtouch.supervisor.diagnose.contact_faults import ContactFault, ContactFaultDetector
 from handtouch.supervisor.diagnose.descriptions import describe_contact_fault, describe_static_load
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables
-from handtouch.supervisor.diagnose.static_load import StaticLoad
+from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS, StaticLoad
 from handtouch.wire.faults import FaultKind
 
 PAD, SECOND = 13, 1_000_000_000
@@ -306,6 +306,20 @@ def test_static_signal_of_one_channel_is_an_offset(size: float) -> None:
 def test_slowly_growing_leakage_is_moisture() -> None:
     diagnosis, _ = play(lambda t, _: fractions(0.4, 0.4) * 2000 * max(0.0, -np.expm1(-(t - 5) / 30)), 60)
     assert [f.kind for f in diagnosis.diagnoses()] == [FaultKind.MOISTURE]
+
+
+def test_moisture_ends_when_the_pad_has_dried() -> None:
+    """It stays while there is a leak, also a small one, and nothing else is diagnosed meanwhile."""
+    dried_s = 80 + 15 * np.log(2000 / MIN_LOAD_COUNTS)
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        leak = fractions(0.4, 0.4) * 2000 * max(0.0, -np.expm1(-(t - 5) / 15)) * np.exp(-max(t - 80, 0) / 15)
+        return np.asarray(leak + presses(t))
+
+    diagnosis, changes = play(contacts, dried_s + 30)
+    assert diagnosis.diagnoses() == []
+    assert {change.kind for change in changes} == {FaultKind.MOISTURE}
+    assert changes[-1].until_ns == pytest.approx((dried_s + 1) * SECOND, abs=10 * SECOND)
 
 
 def test_open_electrode_is_a_dead_electrode() -> None:
