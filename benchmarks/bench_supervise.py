@@ -394,7 +394,8 @@ exactly as in the file, one seed. One reading of each contact, at a random age. 
 instead of learned ones, which is what handtouch compensated before it learned any. *In 95 %*: share of
 readings within the stated interval, with the 95 % interval of a binomial count; *by pad*: with that of the
 scatter between pads, as readings of one pad share gain and parameters. *Width* of the stated 95 % interval.
-*All* are the world's own kinds, also by age of the contact.""",
+*All* are the world's own kinds, also by age of the contact. A day of the same use is in
+[soak_sheets](soak_sheets.md).""",
         PARTS: "The first seed in `default`, its own kinds, without some parts; a third of the time.",
         UNKNOWN: f"""The same sheets, all with `preset = "unknown"`, which hold one object of
 {Holds.HELD_N:g} N again and again, {Holds.HELD_S:g} s each time, compared at the end of each hold. What is
@@ -440,7 +441,7 @@ def force_tables(found: dict[tuple[str, str], Estimates]) -> tuple[Rows, Rows]:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--hours", type=float, default=6.0, help="of mixed use (default: 6)")
+    parser.add_argument("--hours", type=float, default=2.0, help="of mixed use (default: 2)")
     asked = parser.parse_args()
     quick = asked.quick
     hours, held_s, pads = (0.25, 120.0, 2) if quick else (asked.hours, 3600.0, PADS)

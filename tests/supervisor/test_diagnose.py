@@ -308,6 +308,18 @@ def test_slowly_growing_leakage_is_moisture() -> None:
     assert [f.kind for f in diagnosis.diagnoses()] == [FaultKind.MOISTURE]
 
 
+def test_gum_on_a_sheet_that_adapts_is_no_moisture() -> None:
+    """It came at once, though its current more than doubles within half a minute."""
+
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        gum = fractions(0.3, 0.6) * 600 * (1 - 1.4 * np.expm1(-(t - 5) / 10)) * (t > 5)
+        return np.asarray(gum + (presses(t) if t % 4 > 3 else 0.0))
+
+    diagnosis, changes = play(contacts, 60)
+    assert {change.kind for change in changes} == {FaultKind.GUM}
+    assert [found.kind for found in diagnosis.diagnoses()] == [FaultKind.GUM]
+
+
 def test_moisture_ends_when_the_pad_has_dried() -> None:
     """It stays while there is a leak, also a small one, and nothing else is diagnosed meanwhile."""
     dried_s = 80 + 15 * np.log(2000 / MIN_LOAD_COUNTS)
