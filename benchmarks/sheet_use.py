@@ -170,6 +170,7 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int, kind_of_use: ty
             held.touching[:], held.uncompensated_force_n[:] = touching, apparent
             held.uncompensated_std_n[:] = law_std * apparent
             compensation.compensate_forces(t_ns)
+            compensation.complete_update()
             due = np.flatnonzero(touching & ~compared & (load > 0) & (use.age_s >= use.sample_s))
             compared[due] = True
             rows += [

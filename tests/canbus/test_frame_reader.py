@@ -1,4 +1,5 @@
-"""Batches of frames from a socket, a pair of Unix sockets in place of SocketCAN: stored, routed, counted."""
+"""Batches of frames from a socket, a pair of Unix sockets in place of SocketCAN or of multicast: stored,
+routed, counted."""
 
 from __future__ import annotations
 
@@ -9,14 +10,17 @@ import time
 from collections.abc import Iterator
 
 import can
+import msgpack
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from handtouch.canbus.bus.frame_reader import FrameReader, enable_stamps
 from handtouch.canbus.bus.port import Port
-from handtouch.canbus.bus.receivers import MAX_DRAIN_FRAMES
+from handtouch.canbus.bus.receivers import MAX_DRAIN_FRAMES, clock_offset_ns
 from handtouch.canbus.bus.router import CanFrame, Router
-from handtouch.canbus.bus.sockets import SocketcanReceiver
+from handtouch.canbus.bus.sockets import DatagramReceiver, SocketcanReceiver
 from handtouch.config import Bus
 from handtouch.core.slab import ChannelField, Slab
 
@@ -48,14 +52,16 @@ class PairBus(can.BusABC):
 class Rig:
     """A port on one end, whose other end is the rest of the bus."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: type[SocketcanReceiver] | type[DatagramReceiver] = SocketcanReceiver) -> None:
         self.other, self.ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         for end in (self.other, self.ours):
             end.setblocking(False)
         self.slab = Slab(SLOTS)
         self.slab.set_layout(2, TWO_PDOS)
-        receiver = SocketcanReceiver(lambda: PairBus(self.ours), "pair").open()
-        self.port = Port(Bus(name="palm", interface="socketcan", channel="pair"), receiver, self.slab)
+        options = {"channel": "pair"} if kind is SocketcanReceiver else {}
+        receiver = kind(lambda: PairBus(self.ours), **options).open()
+        interface = "socketcan" if kind is SocketcanReceiver else "udp_multicast"
+        self.port = Port(Bus(name="palm", interface=interface, channel="pair"), receiver, self.slab)
         set_routes(self.port.router)
 
     def close(self) -> None:
@@ -210,3 +216,84 @@ def test_a_closed_peer_is_reported_and_reading_never_raises(rig: Rig) -> None:
     assert rig.port.drain() == []
     assert not rig.port.send(0x80, b"")
     assert rig.port.counters.send_failures == 1
+
+
+MESSAGES = st.builds(
+    can.Message,
+    timestamp=st.floats(0, 1e10),
+    arbitration_id=st.one_of(
+        st.sampled_from([0x281, 0x282, 0x283, 0x383, 0x80, 0x77, 0x711]), st.integers(0, 0x7FF)
+    ),
+    is_extended_id=st.sampled_from([False] * 4 + [True]),
+    is_remote_frame=st.sampled_from([False] * 6 + [True]),
+    is_error_frame=st.sampled_from([False] * 6 + [True]),
+    is_fd=st.sampled_from([False] * 6 + [True]),
+    channel=st.sampled_from([None, None, "can0", 3]),
+    data=st.one_of(
+        st.binary(min_size=6, max_size=6), st.binary(max_size=8), st.binary(min_size=8, max_size=8)
+    ),
+)
+PACKETS = st.one_of(
+    MESSAGES.map(pack_message),
+    MESSAGES.map(pack_message),
+    MESSAGES.map(lambda message: pack_message(message)[:-1]),
+    MESSAGES.map(lambda message: pack_message(message) + b"\x00"),
+    st.binary(max_size=400),
+    st.integers(0x800, 0xFFFF).map(lambda can_id: _with_identifier(can_id)),
+)
+
+
+def _with_identifier(can_id: int) -> bytes:
+    packed = pack_message(can.Message(arbitration_id=0x7FF, data=bytes(8), is_extended_id=False))
+    return packed.replace(b"\xcd\x07\xff", b"\xcd" + can_id.to_bytes(2, "big"))
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(PACKETS, max_size=19))
+def test_a_batch_of_packets_has_the_result_of_python_cans_messages_one_by_one(packets: list[bytes]) -> None:
+    rig = Rig(DatagramReceiver)
+    for data in packets:
+        rig.other.send(data)
+    others = rig.port.drain()
+    expected_slab = Slab(SLOTS)
+    expected_slab.set_layout(2, TWO_PDOS)
+    router, expected, failures = Router(expected_slab), [], 0
+    set_routes(router)
+    for data in packets:
+        try:
+            message = unpack_message(data, check=True)
+        except Exception:  # noqa: BLE001 - whatever it raises is counted
+            failures += 1
+            continue
+        if other := router.accept_message(message, 1):
+            expected.append(other)
+    router.counters.receive_failures = failures
+    assert [other[:2] for other in others] == [other[:2] for other in expected]
+    assert rig.port.counters == router.counters
+    assert rig.slab.unpack_counts().tolist() == expected_slab.unpack_counts().tolist()
+    assert rig.slab.repeat_counts.tolist() == expected_slab.repeat_counts.tolist()
+    rig.close()
+
+
+def test_frames_behind_a_malformed_packet_are_received_with_it() -> None:
+    rig = Rig(DatagramReceiver)
+    good = pack_message(can.Message(arbitration_id=0x281, data=b"\x01\x00" * 4, is_extended_id=False))
+    for data in (msgpack.packb({"arbitration_id": "x"}), good, b"\xc1", good):
+        rig.other.send(data)
+    rig.port.drain()
+    counters = rig.port.counters
+    assert (counters.samples, counters.receive_failures) == (2, 2)
+    assert rig.slab.unpack_counts()[0].tolist() == [1, 1, 1, 1]
+    rig.close()
+
+
+@pytest.mark.parametrize("step_s", [-3600, 3600])
+def test_step_of_the_wall_clock_moves_no_stamp_beyond_the_time_of_reading(step_s: int) -> None:
+    reader = FrameReader()
+    other, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with other, ours:
+        enable_stamps(ours)
+        earliest_ns = time.monotonic_ns()
+        other.send(frame(0x281, bytes(8)))
+        assert reader.receive(ours.fileno(), clock_offset_ns() + step_s * 10**9, earliest_ns) == 1
+        assert earliest_ns <= reader.frame(0).arrival_ns <= time.monotonic_ns()

@@ -42,6 +42,7 @@ class Rig:
         self.tick_state.touching[:] = self.touching
         self.tick_state.uncompensated_force_n[:], self.tick_state.uncompensated_std_n[:] = apparent, 0.0
         self.compensation.compensate_forces(self.t_ns)
+        self.compensation.complete_update()
 
     def run(self, seconds: float, load_n: FloatArray) -> None:
         for _ in range(round(seconds / DT_S)):
@@ -194,6 +195,7 @@ def test_the_error_of_the_contact_law_counts_once() -> None:
     for _ in range(2):
         rig.t_ns += PERIOD_NS
         rig.compensation.compensate_forces(rig.t_ns)
+        rig.compensation.complete_update()
     assert rig.compensation.std_n[0] == pytest.approx(rig.compensation.std_n[1], rel=1e-6)
 
 
@@ -240,6 +242,7 @@ def test_sheets_of_two_behaviours_and_none_are_independent() -> None:
     state.uncompensated_force_n[:3], state.uncompensated_std_n[:], state.touching[:3] = 1.0, 0.1, True
     for t_ns in range(10**9, 2 * 10**9, PERIOD_NS):
         compensation.compensate_forces(t_ns)
+        compensation.complete_update()
     assert np.isfinite(compensation.std_n).tolist() == [True, False, True, True]
     assert (compensation.force_n[[0, 2]] > 0).all()
     assert compensation.state[1] == ForceReliability.RELIABLE

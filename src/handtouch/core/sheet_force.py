@@ -115,6 +115,7 @@ class SheetForceCompensation:
         self.groups = _make_groups(behaviours, held, self._results)
         stage = self._make_stage()
         self.compensate_forces, self.store_forces = stage.compensate_forces, stage.store_forces
+        self.complete_update = stage.complete_update
 
     def with_behaviours(
         self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
@@ -305,7 +306,7 @@ class SheetForceCompensation:
         # either includes the error of the contact law
         common = np.maximum(relative, self.log_gain_std[pressed])
         variance = np.square(self.std_n[pressed]) + np.square(force * common)
-        std = np.sqrt(variance)
+        self.std_n[pressed] = std = np.sqrt(variance)
         self._relative_std[pressed] = std / np.maximum(force, _MIN_FORCE_N)
         enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
         known = enough | self._confirmed[pressed]

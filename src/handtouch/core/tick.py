@@ -274,7 +274,10 @@ class TickProcessor:
         self.slip.detect_slips(np.concatenate([result.began, result.updated]))
 
     def prepare_next_tick(self) -> None:
-        """Update the baseline. Call between two ticks, off the critical path: it changes no contact."""
+        """Update the baseline, and the uncertainty of forces of later ticks. Call between two ticks, off the
+        critical path: it changes no contact."""
+        if self.sheet_force.any_modelled:
+            self.sheet_force.complete_update()
         if self.sync_ns:
             self.baseline.update_baseline(self.sync_ns, self.contacts.touching)
 

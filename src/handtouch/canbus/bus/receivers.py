@@ -124,14 +124,6 @@ class ReopenBackoff:
         self._due_ns = 0
 
 
-def bounded_arrival_ns(arrival_ns: int, emptied_ns: int) -> int:
-    """Return a receive stamp, not before the queue was empty last and not after now.
-
-    A step of the wall clock between arrival and reading would falsify it.
-    """
-    return min(max(arrival_ns, emptied_ns), time.monotonic_ns())
-
-
 def clock_offset_ns() -> int:
     """Return monotonic minus wall clock; read again if the process was interrupted between the readings."""
     for _ in range(3):

@@ -14,17 +14,21 @@ import time
 from typing import Any, Self
 
 import can
-import msgpack
 from can.interfaces.udp_multicast.utils import unpack_message
 
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
-from handtouch.canbus.bus.frame_reader import BATCH_FRAMES, FrameReader, RawFrame, enable_stamps
+from handtouch.canbus.bus.frame_reader import (
+    BATCH_FRAMES,
+    FrameReader,
+    PacketReader,
+    RawFrame,
+    enable_stamps,
+)
 from handtouch.canbus.bus.receivers import (
     MAX_DRAIN_FRAMES,
     CyclicSender,
     Opener,
     ReopenBackoff,
-    bounded_arrival_ns,
     clock_offset_ns,
     closed_bus_fault,
     grow_receive_buffer,
@@ -34,16 +38,12 @@ from handtouch.canbus.bus.receivers import (
 from handtouch.canbus.bus.router import IDENTIFIER_COUNT, CanFrame, Router
 from handtouch.core.stages.receive import frame_arrival_ns
 
-_SO_TIMESTAMPNS, _SO_MEMINFO = 35, 55
+_SO_MEMINFO = 55
 _MEMINFO_DROPS_INDEX = 8  # of 32-bit words
 _DROPPED_PERIOD_NS = 50_000_000
 _DROPPED_FRAMES = 32
 """Dropped frames are counted that often, and whenever so many were waiting: only a full queue drops any."""
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
-_TIMESPEC = struct.Struct("@ll")
-_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size)
-_MAX_DATAGRAM_BYTES = 4096  # as in python-can
-_FLAGS = ("is_extended_id", "is_remote_frame", "is_error_frame", "is_fd")
 _REMOTE_FLAG, _ERROR_FLAG, _IDENTIFIER_MASK = 0x40000000, 0x20000000, 0x1FFFFFFF
 
 
@@ -102,8 +102,7 @@ class _SocketReceiver:
             self._consecutive_errors = 0
             self._backoff.reset()
         if failure is not None:
-            self._failure_ns = time.monotonic_ns()
-            self._record_failure(router, failure)
+            self._fail(router, failure)
         return others
 
     def send(self, can_id: int, data: bytes, remote: bool = False) -> None:
@@ -140,7 +139,8 @@ class _SocketReceiver:
         except Exception as error:  # noqa: BLE001 - drivers raise anything
             self.fault = fault_from_exception(error)
 
-    def _record_failure(self, router: Router, error: Exception) -> None:
+    def _fail(self, router: Router, error: Exception) -> None:
+        self._failure_ns = time.monotonic_ns()
         router.counters.receive_failures += 1
         self.fault = fault_from_exception(error)
         self._consecutive_errors += 1
@@ -185,15 +185,12 @@ class SocketcanReceiver(_SocketReceiver):
         return super()._reopen(router)
 
     def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
-        reader, accept_samples, descriptor = self._reader, router.accept_samples, self._socket.fileno()
+        reader, descriptor = self._reader, self._socket.fileno()
         offset_ns, read = clock_offset_ns(), 0
         while True:
             before_ns = time.monotonic_ns()
             count = reader.receive(descriptor, offset_ns, self._emptied_ns)
-            first = accept_samples(reader.batch, 0, count)
-            while first < count:
-                _accept_other(router, reader.frame(first), others)
-                first = accept_samples(reader.batch, first + 1, count)
+            _accept_batch(reader, router, 0, count, others)
             if count:
                 self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
             if count < BATCH_FRAMES:
@@ -217,6 +214,14 @@ class SocketcanReceiver(_SocketReceiver):
             raise OSError(errno.ENODEV, self.fault.text if self.fault else "closed")
         # Not stored: with the task of a removed device python-can's shutdown would fail and close nothing.
         return _KernelSender(self._bus.send_periodic(make_message(can_id, data), period_s, store_task=False))
+
+
+def _accept_batch(reader: FrameReader, router: Router, first: int, end: int, others: list[CanFrame]) -> None:
+    """Pass frames `first` to `end` of a batch to the router."""
+    first = router.accept_samples(reader.batch, first, end)
+    while first < end:
+        _accept_other(router, reader.frame(first), others)
+        first = router.accept_samples(reader.batch, first + 1, end)
 
 
 def _accept_other(router: Router, frame: RawFrame, others: list[CanFrame]) -> None:
@@ -251,49 +256,46 @@ class _KernelSender:
 
 
 class DatagramReceiver(_SocketReceiver):
-    """Receiver for udp_multicast; python-can's `recv` calls select and checks every key for each frame."""
+    """Receiver for udp_multicast, in batches; python-can's `recv` calls select and checks every key for each
+    frame."""
 
-    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
-        recvmsg, unpack, accept, stamp = (
-            self._socket.recvmsg,
-            msgpack.unpackb,
-            router.accept_frame,
-            _TIMESPEC.unpack,
-        )
-        offset_ns, emptied_ns, now_ns = clock_offset_ns(), self._emptied_ns, time.monotonic_ns()
-        arrival_ns = now_ns
-        for _ in range(MAX_DRAIN_FRAMES):
-            try:
-                packet, ancillary, _, _ = recvmsg(_MAX_DATAGRAM_BYTES, _ANCILLARY, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                self._emptied_ns, self._newest_ns = now_ns, arrival_ns
+    def __init__(self, opener: Opener) -> None:
+        self._reader = PacketReader()
+        super().__init__(opener)
+
+    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:
+        reader, descriptor = self._reader, self._socket.fileno()
+        offset_ns, read = clock_offset_ns(), 0
+        while bus is self._bus:
+            before_ns = time.monotonic_ns()
+            count = reader.receive(descriptor, offset_ns, self._emptied_ns)
+            first = 0
+            while first < count:
+                end = reader.unpack(first, count)
+                _accept_batch(reader, router, first, end, others)
+                if end < count:
+                    self._accept_packet(router, *reader.packet(end), others)
+                first = end + 1
+            if count:
+                self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
+            if count < BATCH_FRAMES:
+                self._emptied_ns = before_ns
                 return
-            for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    seconds, nanoseconds = stamp(value)
-                    arrival_ns = seconds * 1_000_000_000 + nanoseconds + offset_ns
-            if not emptied_ns <= arrival_ns <= now_ns:
-                arrival_ns = bounded_arrival_ns(arrival_ns, emptied_ns)
-            fields = unpack(packet)
-            if _is_data_frame(fields):
-                can_id, data = fields["arbitration_id"], fields["data"]
-                if not accept(can_id, data, arrival_ns):
-                    others.append((can_id, data, arrival_ns))
-                continue
-            frame = router.accept_message(unpack_message(packet, check=True), arrival_ns)
-            if frame is not None:
-                others.append(frame)
-        self.backlog_ns = self._newest_ns = arrival_ns
+            read += count
+            if read >= MAX_DRAIN_FRAMES:
+                self.backlog_ns = self._newest_ns
+                return
 
-
-def _is_data_frame(fields: Any) -> bool:
-    """Return True for a plain data frame; python-can decodes other packets, and raises for invalid ones."""
-    if type(fields) is not dict or type(can_id := fields.get("arbitration_id")) is not int:
-        return False
-    if type(data := fields.get("data")) is not bytes or fields.get("dlc") != len(data):
-        return False
-    flags = map(fields.get, _FLAGS)
-    return 0 <= can_id < IDENTIFIER_COUNT and len(data) <= 8 and not any(flags)
+    def _accept_packet(self, router: Router, packet: bytes, arrival_ns: int, others: list[CanFrame]) -> None:
+        """Accept a packet that isn't packed as plain data frames are; count what python-can can't unpack."""
+        try:
+            message = unpack_message(packet, check=True)
+        except Exception as error:  # noqa: BLE001 - msgpack and python-can raise anything on bad input
+            self._fail(router, error)
+            return
+        frame = router.accept_message(message, arrival_ns)
+        if frame is not None:
+            others.append(frame)
 
 
 def _dropped_frames(target: socket.socket) -> int:

@@ -1,7 +1,7 @@
 cimport cython
 
 cdef long long _STAMP_KIND, _LOW_HALF
-cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE, _FIELD
+cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE, _FIELD, _PACKET, _PATTERN, _DATA_BYTES
 cdef Py_ssize_t _CONTROL_SIZE, _MESSAGE_SIZE, _STAMP_BYTES, _FRAME_BYTES, _IDENTIFIERS, _WORDS_OF_SLOT
 
 cdef class SampleMemory:
@@ -13,6 +13,14 @@ cdef class FrameBatch:
     cdef long long[::1] headers, frames, control
     cdef public long long offset_ns, earliest_ns, latest_ns
 
+cdef class PacketMemory:
+    cdef long long[::1] words, masks, patterns
+    cdef unsigned char[::1] octets
+    cdef Py_ssize_t empty_size, id_at, data_at
+
+@cython.locals(i=Py_ssize_t, k=Py_ssize_t, size=Py_ssize_t, begin=Py_ssize_t, masked='long long',
+               can_id='long long', data='long long', scale='long long', octet='long long')
+cpdef Py_ssize_t unpack_packets(PacketMemory packets, FrameBatch batch, Py_ssize_t first, Py_ssize_t count)
 @cython.locals(i=Py_ssize_t, head='long long', can_id='long long', slot='long long', size='long long',
                message_size='long long')
 cpdef Py_ssize_t store_samples(

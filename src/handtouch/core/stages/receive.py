@@ -1,8 +1,9 @@
 """Samples of a batch of CAN frames, stored in the slab's memory.
 
-Public names: `SampleMemory`, `FrameBatch`, `store_samples`, `frame_arrival_ns`, `begin_cycle`,
-`unpack_counts`, `HEADER_WORDS`, `FRAME_WORDS`, `CONTROL_WORDS`, `ROUTE_WORDS`, `FIELD_WORDS`. Memory is read
-in words of 64 bits; the layouts are those of Linux on 64-bit little-endian processors.
+Public names: `SampleMemory`, `FrameBatch`, `PacketMemory`, `store_samples`, `unpack_packets`,
+`frame_arrival_ns`, `begin_cycle`, `unpack_counts`, `HEADER_WORDS`, `FRAME_WORDS`, `CONTROL_WORDS`,
+`PACKET_WORDS`, `PATTERN_WORDS`, `ROUTE_WORDS`, `FIELD_WORDS`. Memory is read in words of 64 bits; the layouts
+are those of Linux on 64-bit little-endian processors.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ _HEADER, _FRAME, _CONTROL, _ROUTE = 8, 9, 4, 2
 HEADER_WORDS, FRAME_WORDS, CONTROL_WORDS, ROUTE_WORDS = _HEADER, _FRAME, _CONTROL, _ROUTE
 """Words of a `struct mmsghdr`, of the longest frame (`struct canfd_frame`), of a control message with a
 `struct timespec`, and of a route."""
+_PACKET, _PATTERN = 40, 21
+PACKET_WORDS, PATTERN_WORDS = _PACKET, _PATTERN
+"""Words that a packet with a frame may take, and of the longest that is unpacked here."""
 _FIELD = 4
 FIELD_WORDS = _FIELD
 """Words that describe a channel's field."""
@@ -18,7 +22,7 @@ _CONTROL_SIZE, _MESSAGE_SIZE = 5, 7  # words of a `struct mmsghdr`
 _STAMP_BYTES = 32
 _STAMP_KIND = 35 << 32 | 1  # SCM_TIMESTAMPNS of SOL_SOCKET
 _FRAME_BYTES = 16
-_IDENTIFIERS = 0x800
+_DATA_BYTES, _IDENTIFIERS = 8, 0x800
 _WORDS_OF_SLOT = 4
 _LOW_HALF = 0xFFFFFFFF
 
@@ -64,6 +68,56 @@ class FrameBatch:
     def __init__(self, headers: memoryview[int], frames: memoryview[int], control: memoryview[int]) -> None:
         self.headers, self.frames, self.control = headers, frames, control
         self.offset_ns = self.earliest_ns = self.latest_ns = 0
+
+
+class PacketMemory:
+    """Packets with one frame each, as udp_multicast sends them, and what that of a data frame looks like.
+
+    words: (packets PACKET_WORDS,), octets: the same memory in bytes. masks, patterns: (9 PATTERN_WORDS,), of
+    packets of 0 to 8 bytes of data, bits that are alike in all, and their values; empty_size: bytes of one
+    without data. id_at, data_at: bytes before the identifier (two bytes, big-endian) and the data.
+    """
+
+    def __init__(
+        self,
+        words: memoryview[int],
+        octets: memoryview[int],
+        masks: memoryview[int],
+        patterns: memoryview[int],
+        empty_size: int,
+        id_at: int,
+        data_at: int,
+    ) -> None:
+        self.words, self.octets, self.masks, self.patterns = words, octets, masks, patterns
+        self.empty_size, self.id_at, self.data_at = empty_size, id_at, data_at
+
+
+def unpack_packets(packets: PacketMemory, batch: FrameBatch, first: int, count: int) -> int:
+    """Write the frames in packets of a batch of `count`, from `first` up to the next that looks otherwise, to
+    the frames of the batch; return its number, `count` without one."""
+    for i in range(first, count):
+        size = (batch.headers[_HEADER * i + _MESSAGE_SIZE] & _LOW_HALF) - packets.empty_size
+        if size < 0 or size > _DATA_BYTES:
+            return i
+        for k in range(_PATTERN):
+            masked = packets.words[_PACKET * i + k] & packets.masks[_PATTERN * size + k]
+            if masked != packets.patterns[_PATTERN * size + k]:
+                return i
+        begin = 8 * _PACKET * i
+        can_id = 256 * packets.octets[begin + packets.id_at] + packets.octets[begin + packets.id_at + 1]
+        if can_id >= _IDENTIFIERS:
+            return i
+        data, scale = 0, 1
+        for k in range(size):
+            octet = packets.octets[begin + packets.data_at + k]
+            if k == _DATA_BYTES - 1 and octet >= 128:
+                octet -= 256
+            data += octet * scale
+            scale = scale * 256 if k < _DATA_BYTES - 1 else scale
+        batch.frames[_FRAME * i] = can_id + (size << 32)
+        batch.frames[_FRAME * i + 1] = data
+        batch.headers[_HEADER * i + _MESSAGE_SIZE] = _FRAME_BYTES
+    return count
 
 
 def store_samples(

@@ -20,9 +20,11 @@ cdef class SheetStage:
     cdef object update, make_steps
     cdef list steps
     cdef long long periods
-    cdef bint due
-    @cython.locals(periods='long long', back_due=bint, k=Py_ssize_t)
+    cdef bint due, began, back_due
+    @cython.locals(periods='long long', k=Py_ssize_t)
     cpdef compensate_forces(self, long long sync_ns)
+    @cython.locals(uncertainties=bint)
+    cpdef complete_update(self)
     @cython.locals(row=Py_ssize_t, pad=Py_ssize_t, first=Py_ssize_t, force=double, saturated=bint)
     cpdef store_forces(self)
 

@@ -53,7 +53,8 @@ class SheetStage:
 
     pads: (n,) pad of each row of the sheets' state, of which the first `sheets` are used. gain: (n,) of each
     pad's force. results: (4 n,) load, load before hysteresis, effective load and reading of each row.
-    update: called with True when uncertainties of forces are to be updated, with False when back forces only.
+    update: called with True when uncertainties of forces are to be updated, with False when back forces only:
+    within a tick for contacts that began in it, else by `complete_update`.
     make_steps: returns the intervals of all behaviours of a duration [s].
     """
 
@@ -72,7 +73,8 @@ class SheetStage:
         make_steps: Callable[[float], list[SheetInterval]],
     ) -> None:
         self.update, self.make_steps = update, make_steps
-        self.periods, self.steps, self.due = -1, make_steps(0.0), False
+        self.periods, self.steps = -1, make_steps(0.0)
+        self.due = self.began = self.back_due = False
         self.pads, self.sheets, self.gain, self.results = pads, sheets, gain, results
         self.columns, self.play_columns = elements, plays
         self.rows = len(pads)
@@ -99,14 +101,21 @@ class SheetStage:
         if periods != self.periods:
             self.periods = periods
             self.steps = self.make_steps(periods * self.period_ns * 1e-9)
-        back_due = False
+        self.back_due = False
         for k in range(len(self.steps)):
             if _compensate_sheets(self, self.steps[k]):
-                back_due = True
+                self.back_due = True
         _find_pressed(self, periods * self.period_ns * 1e-9)
-        if back_due or self.due:
-            self.update(self.due)
+        if self.began:  # its first message has an uncertainty
+            self.complete_update()
         self.store_forces()
+
+    def complete_update(self) -> None:
+        """Update what is due, which takes longer than all else here; once a tick, after its messages."""
+        if self.back_due or self.due:
+            uncertainties = self.due
+            self.back_due = self.due = False
+            self.update(uncertainties)
 
     def store_forces(self) -> None:
         """Replace the forces of touched pads in the contacts' values by compensated ones."""
@@ -145,7 +154,7 @@ def _compensate_sheets(stage: SheetStage, step: SheetInterval) -> bool:
 
 def _find_pressed(stage: SheetStage, dt_s: float) -> None:
     """Apply the gains to the forces of touched pads; decide whether uncertainties are due."""
-    pressed = stage.due = False
+    pressed = stage.began = False
     for row in range(stage.sheets):
         pad = stage.pads[row]
         if stage.touching[pad]:
@@ -153,12 +162,11 @@ def _find_pressed(stage: SheetStage, dt_s: float) -> None:
             stage.last_touch_ns[pad] = stage.updated_ns[0]
             stage.force_n[pad] *= stage.gain[pad]
             if stage.new_contact[pad]:
-                stage.due = True
+                stage.began = True
     stage.waited_s[0] += dt_s
     if not pressed:
         stage.waited_s[0] = 0.0
-    elif stage.waited_s[0] >= stage.update_period_s:
-        stage.due = True
+    stage.due = stage.began or stage.waited_s[0] >= stage.update_period_s
 
 
 def _compensate_sheet(stage: SheetStage, step: SheetInterval, row: int, old: bool) -> None:
