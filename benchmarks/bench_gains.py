@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 PADS = {"1:1": Rectangle(1.0, 1.0), "1.8:1": Rectangle(1.8, 1.0)}
 COUNTS = (100, 400, 1600)
-TRIALS = 60
+TRIALS = 40
 TRIALS_ELONGATED = 10
 GAIN_STD = 0.02
 

@@ -246,7 +246,7 @@ def write(name: str, page_of: Callable[[dict[str, Any]], str], rows: Rows, asked
 
 
 def main() -> None:
-    asked = asked_of(__doc__, seconds=5.0, turns=3, quick_s=1.5)
+    asked = asked_of(__doc__, seconds=5.0, turns=2, quick_s=1.5)
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         rows = measure(on_loopback(Path(folder), PORT), asked.turns, asked.seconds)

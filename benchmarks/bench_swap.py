@@ -50,7 +50,7 @@ SHAPES = {"1:1": 20.0, "1.8:1": 36.0}
 WIDTH_MM = 20.0
 UNITS = 6
 """Nodes of each shape in each world."""
-COUNTS = (0, 16, 32, 64, 96, 128, 192, 256, 384, 512)
+COUNTS = (0, 16, 32, 64, 96, 128, 192, 256)
 TICKS = 12
 """Samples of a contact."""
 PERIOD_NS = 5_000_000

@@ -20,10 +20,11 @@ from page import OUT, keep_run_time, measured_commit
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
-    "claims", "design", "diagnose", "diagnose_cases", "electrodes", "gains", "grasp", "percept_grasp",
-    "resolution", "shear", "shear_slip", "sheet", "supervise", "swap", "worlds",
+    "diagnose", "worlds", "claims", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
+    "swap", "shear_slip", "estimate", "percept_grasp", "resolution", "shear", "design", "sheet",
 )  # fmt: skip
-"""Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside)."""
+"""Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside); the
+longest first, so that none of them is the last for long."""
 
 
 class Runner:
@@ -94,7 +95,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     if len(programs) == 1:
         return subprocess.run(command(programs[0], options), cwd=ROOT, check=False).returncode
-    beside = [path for path in programs if path.stem in {f"bench_{name}" for name in SIDE_BY_SIDE}]
+    order = {f"bench_{name}": place for place, name in enumerate(SIDE_BY_SIDE)}
+    beside = sorted((path for path in programs if path.stem in order), key=lambda path: order[path.stem])
     runner = Runner(OUTPUT, options)
     print(f"{len(programs)} programs; what they print goes to {OUTPUT.relative_to(ROOT)}", flush=True)
     runner.run(beside, os.cpu_count() or 1)
