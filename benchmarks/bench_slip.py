@@ -377,7 +377,7 @@ world `ideal`; thresholds with at most one false alarm a minute and contact. The
 ## Cost
 
 Of a tick with {len(PADS)} contacts: samples to contacts; then, after contacts are sent, the slip stage
-and the messages of motion percepts. Medians of wall time on shared cores. Nothing is called without a
+and the messages of motion percepts. Medians of processor time. Nothing is called without a
 subscriber, as a test shows.
 
 {table(["Hz", "contacts", "tick us", "slip us", "99 % us", "messages us"], cost)}
