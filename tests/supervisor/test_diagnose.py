@@ -71,8 +71,9 @@ def simulate(
     length_s: float,
     series_ohm: tuple[float, ...] = (0.0,) * 4,
     world: DrawnWorld | None = None,
+    *others: dict[str, object],
 ) -> list[PadDiagnosis]:
-    """Return the diagnoses of one pad of the virtual hand, pressed all over while it has a fault."""
+    """Return the diagnoses of one pad of the virtual hand, pressed all over while it has faults."""
     whole = config.load(shipped.path("utah_mit.toml"))
     (hand,) = whole.hands
     (pad,) = (pad for pad in hand.pads if pad.link == LINK)
@@ -85,9 +86,9 @@ def simulate(
         )
         for at in np.arange(0.5, length_s - 1, 1.0).tolist()
     )
-    acting = FAULTS[str(fault["kind"])].model_validate(fault)
+    acting = tuple(FAULTS[str(one["kind"])].model_validate(one) for one in (fault, *others))
     world = world or WORLDS["default"].only("parts", "contacts").draw(3)
-    virtual = VirtualHand(alone, Scenario(touch=touches), world, faults=(acting,))
+    virtual = VirtualHand(alone, Scenario(touch=touches), world, faults=acting)
     diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"))
     run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
     return diagnosis.diagnoses()
@@ -469,6 +470,15 @@ def test_short_behind_a_series_resistor_is_diagnosed(series_ohm: float) -> None:
     fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 1.0, "electrode": "y0", "short_ohm": 20.0}
     (found,) = simulate(fault, 25, series_ohm=(series_ohm,) * 4)
     assert (found.kind, found.electrodes) == (FaultKind.SHORTED_ELECTRODE, ("y0",))
+
+
+def test_short_of_a_pad_with_a_dead_electrode_is_no_saturated_channel() -> None:
+    """The current that the dead electrode doesn't take is in the others."""
+    dead: dict[str, object] = {"kind": "dead_electrode", "link": LINK, "from_s": 2.0, "electrode": "y0"}
+    short: dict[str, object] = {"kind": "shorted_electrode", "link": LINK, "from_s": 4.0, "electrode": "x0"}
+    found = simulate(short, 30, (0.0,) * 4, None, dead)
+    assert ("x0",) in [one.electrodes for one in found if one.kind == FaultKind.SHORTED_ELECTRODE]
+    assert FaultKind.SATURATED_CHANNEL not in [one.kind for one in found]
 
 
 def test_saturation_under_a_lasting_contact_is_less_certain() -> None:

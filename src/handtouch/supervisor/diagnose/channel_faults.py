@@ -32,6 +32,9 @@ _MAX_IDLE_DEVIATION, _MAX_IDLE_DEVIATION_OF_SUM = 0.3, 0.03
 _MIN_SHORT_FRACTION = 0.75
 """Of the current through an electrode's series resistor, at which it may be shorted to the layer."""
 _MIN_CHANNELS_OF_SHORT = 2
+_MAX_SILENT_SIGMA = 10.0
+"""Lowest short mean of a channel without a current, of the noise of a reading."""
+_OPEN_OHM = 1e12
 _MIN_WINDOW_NS = 5_000_000_000
 """The lowest readings of the other channels are those of the last one to two such times."""
 _FAULT_CLEAR_NS = 2_000_000_000
@@ -161,9 +164,8 @@ class ChannelFaultDetector:
         healthy[channel] = False
         others = features.mean_counts[:, pad, own][:, healthy]
         least = self._min_counts[pad, channel, own][healthy]
-        expected = self._idle_counts[pad][channel][healthy]
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
-        if count > 0 and len(least) >= _MIN_CHANNELS_OF_SHORT and _matches_short(least, expected):
+        if count > 0 and self._is_short(pad, channel, healthy, least):
             return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
         untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
         if untouched or count < 0:
@@ -171,6 +173,19 @@ class ChannelFaultDetector:
         if lasted > _MIN_RAILED_TOUCHED_NS:  # a contact all the time, or a short of an unusual sheet
             return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence, _TOUCHED_CONFIDENCE)
         return None
+
+    def _is_short(self, pad: int, channel: int, healthy: NDArray[np.bool_], least: FloatArray) -> bool:
+        """Return whether the lowest counts of healthy channels (c,) are those of a short of `channel`.
+
+        Also of a pad with one dead electrode: its channel is silent, the others carry its part.
+        """
+        silent = np.abs(least) < _MAX_SILENT_SIGMA * self._model.reading_noise_counts[pad]
+        if len(least) - silent.sum() < _MIN_CHANNELS_OF_SHORT or silent.sum() > 1:
+            return False
+        expected = self._idle_counts[pad][channel]
+        if silent.any():
+            expected = _idle_counts(self._model, pad, int(np.flatnonzero(healthy)[silent][0]))[channel]
+        return _matches_short(least[~silent], expected[healthy][~silent])
 
 
 def _matches_short(least: FloatArray, expected: FloatArray) -> bool:
@@ -194,14 +209,17 @@ def _repeat_probability(std: FloatArray) -> FloatArray:
     return np.asarray(np.clip((chance**2).sum(axis=1), 0.5, 1 - 1e-3))
 
 
-def _idle_counts(model: DiagnosisModel, row: int) -> FloatArray:
+def _idle_counts(model: DiagnosisModel, row: int, dead: int | None = None) -> FloatArray:
     """Return counts [shorted, channel] with an electrode at the layer's potential; infinite if unknown.
 
+    dead: channel of an electrode that is open.
     Its own channel gets what its series resistor lets through, the others what flows through sheet and
     resistors.
     """
     network = model.networks[row]
-    series, volts = np.asarray(network.series_ohm, np.float64), model.drive_v[row]
+    series, volts = np.array(network.series_ohm, np.float64), model.drive_v[row]
+    if dead is not None:
+        series[dead] = _OPEN_OHM
     scale = model.ampere_per_count[row, : len(series)]
     try:
         conductance = network.conductance / network.sheet_ohm_per_square

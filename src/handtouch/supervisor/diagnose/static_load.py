@@ -57,9 +57,9 @@ _TREMOR_POSITION_STDS = np.geomspace(4e-4, 3e-2, 10)  # standard deviations of a
 _STILL_POSITION_STDS = np.array([0.0, 5e-5, 1.5e-4])
 _MAX_FLOOR_RATIO = 1.25
 _MAX_FADED_PART = 0.67
-_MIN_ABRUPT_PART = 0.38
-"""Of a load, within 3 s of its begin: leaks that grow with time constants from 10 s reach 0.27, gum on sheets
-that adapt falls to 0.45."""
+_MIN_ABRUPT_PART = 0.35
+"""Of a load, within 3 s of its begin: a leak that grows with a time constant of 10 s or more has at most 0.33
+of what it has when it is classified, after 15 s; gum on a sheet that adapts, 0.4 and more."""
 _MIN_TREMOR_NATS = 3.0
 _MAX_TREMOR_NATS, _MAX_STILL_NATS = 15.0, 3.0
 _LASTING_CAUSES = np.array([0.0, 1.0, 0.0, 1.0, 1.0, 0.0])
