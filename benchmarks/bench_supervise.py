@@ -459,21 +459,18 @@ def main() -> None:
         parts_of["default", UNLEARNED] = parts_of["default", COMPLETE]
         parts_of |= {("default", part): SEEDS[:1] for part in CUTS}
         running = {
-            (world, part): [
-                pool.submit(used, world, part, hours / (3 if part in CUTS else 1), seed, pads)
-                for seed in seeds
-            ]
+            (world, part): pool.submit(used, world, part, hours / (3 if part in CUTS else 1), seeds, pads)
             for (world, part), seeds in parts_of.items()
         }
         not_measured = [pool.submit(unmeasured, seed, pads) for seed in SEEDS]
         waiting = [(title, pool.submit(call, *given)) for title, call, given in tasks]
         found: dict[tuple[str, str], Estimates] = {}
-        for key, futures in running.items():
-            found[key] = concatenate([future.result() for future in futures])
+        for key, future in running.items():
+            found[key] = future.result()
             progress(f"sheets of {key[0]}, {key[1] or 'complete'}: {len(found[key])} contacts")
         parts: dict[str, Rows] = {title: [] for title in ("Held object", WARM, TURNED, "Slow presses")}
-        for title, future in waiting:
-            parts[title].extend(future.result())
+        for title, rows in waiting:
+            parts[title].extend(rows.result())
             progress(f"{title}: {parts[title][-1]}")
     parts[DAY], parts[PARTS] = force_tables(found)
     parts[UNKNOWN] = unknown_rows(concatenate([future.result() for future in not_measured]))

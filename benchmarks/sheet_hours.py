@@ -7,6 +7,7 @@ Public names: `used`, `kinds_of`, `of_kinds`, `force_row`, `rms`; `PADS`, `SEEDS
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,13 +37,18 @@ def kinds_of(world: str) -> tuple[SheetKind, ...]:
     return (*WORLDS[world].sheets.kinds(Family.REPORTING), *kinds)
 
 
-def used(world: str, part: str, hours: float, seed: int, pads: int) -> Estimates:
-    """Return force errors of all kinds of sheets of a world, with a part of the compensation left out."""
-    drawn = WORLDS[world].draw(Family.REPORTING.seed(seed))
-    sheets = [drawn_sheets(drawn, kind, pads) for kind in kinds_of(world)]
+def used(
+    world: str, part: str, hours: float, seeds: Sequence[int], pads: int, kinds: Sequence[SheetKind] = ()
+) -> Estimates:
+    """Return force errors of kinds of sheets of a world, by default all, without a part of the compensation.
+
+    `pads` sheets of each kind and seed are used side by side, by the first seed.
+    """
+    drawn = [WORLDS[world].draw(Family.REPORTING.seed(seed)) for seed in seeds]
+    sheets = [drawn_sheets(one, kind, pads) for one in drawn for kind in kinds or kinds_of(world)]
     if part in CUTS:
         sheets = [replace(some, behaviour=some.behaviour.model_copy(update=CUTS[part])) for some in sheets]
-    return score_use([replace(some, learns=part != UNLEARNED) for some in sheets], hours, drawn.seed)
+    return score_use([replace(some, learns=part != UNLEARNED) for some in sheets], hours, drawn[0].seed)
 
 
 def of_kinds(world: str, every: Estimates) -> Estimates:

@@ -20,9 +20,11 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from scores import Estimates, EstimateScore, concatenate, slices
-from sheet_hours import COMPLETE, PADS, SEEDS, UNLEARNED, force_row, of_kinds, rms, used
+from scores import Estimates, EstimateScore, slices
+from sheet_hours import COMPLETE, PADS, SEEDS, UNLEARNED, force_row, rms, used
 from sheet_use import FULL_N
+
+from handtouch.simulate.worlds import WORLDS, Family, SheetKind
 
 PARTS = (("default", COMPLETE), ("default", UNLEARNED), ("harsh", COMPLETE))
 PART_OF_DAY_H = 6.0
@@ -32,13 +34,17 @@ MIN_COVERED_HARSH, MAX_RATIO_HARSH = 0.85, 1.1
 """Of each kind of sheet in `harsh`: the same share, and compensated over uncompensated."""
 
 NOTE = f"""\
-{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and, in `default`, of the
-paper's two, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to {FULL_N:g} N, half of them waxing
-and waning, and breaks of 5 to 60 minutes. Columns as in [supervise](supervise.md#mixed-use-of-sheets): one
-reading of each contact, at a random age; errors rms of valid forces; *ratio*: compensated over uncompensated;
-*in 95 %*: share of readings within the stated interval, also with the scatter between pads; *nothing
-learned*: same seeds, creep and adaptation of the file instead of learned ones. *All* are the world's own
-kinds."""
+{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family, {len(SEEDS)} seeds:
+grips of 2 to 40 s, some of minutes, 0.1 to {FULL_N:g} N, half of them waxing and waning, and breaks of 5 to
+60 minutes. Columns as in [supervise](supervise.md#mixed-use-of-sheets): one reading of each contact, at a
+random age; errors rms of valid forces; *ratio*: compensated over uncompensated; *in 95 %*: share of readings
+within the stated interval, also with the scatter between pads; *nothing learned*: same seeds, creep and
+adaptation of the file instead of learned ones."""
+
+
+def own_kinds(world: str) -> tuple[SheetKind, ...]:
+    """Return the world's kinds of sheets of the reporting family."""
+    return tuple(WORLDS[world].sheets.kinds(Family.REPORTING))
 
 
 def rows_of(found: dict[tuple[str, str], Estimates]) -> list[dict[str, Any]]:
@@ -46,14 +52,13 @@ def rows_of(found: dict[tuple[str, str], Estimates]) -> list[dict[str, Any]]:
     rows = []
     for world in dict.fromkeys(world for world, _ in PARTS):
         every, before = found[world, COMPLETE], found.get((world, UNLEARNED))
-        own = np.isin(every.columns["kind"], of_kinds(world, every).columns["kind"])
         chosen = [(kind, every.columns["kind"] == kind) for kind, _ in slices(every, "kind")]
-        chosen += [(f"all, {age}", own & (every.columns["age"] == age)) for age, _ in slices(every, "age")]
+        chosen += [(f"all, {age}", every.columns["age"] == age) for age, _ in slices(every, "age")]
         hour = every.columns["hour"]
         for low in np.arange(0, hour.max(), PART_OF_DAY_H):
             label = f"all, hours {low:g} to {low + PART_OF_DAY_H:g}"
-            chosen.append((label, own & (hour > low) & (hour <= low + PART_OF_DAY_H)))
-        for name, here in (*chosen, ("all", own)):
+            chosen.append((label, (hour > low) & (hour <= low + PART_OF_DAY_H)))
+        for name, here in (*chosen, ("all", np.ones(len(every), np.bool_))):
             row = force_row(every.where(here), world=world, sheet=name)
             row["nothing learned, N"] = rms(before.error[here & before.valid]) if before else "-"
             rows.append(row)
@@ -68,8 +73,8 @@ def goals(found: dict[tuple[str, str], Estimates]) -> list[dict[str, Any]]:
         error = rms(good.error)
         return error, error / rms(good.columns["uncompensated"]), float((good.distances() <= 1.96).mean())
 
-    error, _, covered = state(of_kinds("default", found["default", COMPLETE]))
-    unlearned, _, _ = state(of_kinds("default", found["default", UNLEARNED]))
+    error, _, covered = state(found["default", COMPLETE])
+    unlearned, _, _ = state(found["default", UNLEARNED])
     kinds = {name: state(some) for name, some in slices(found["harsh", COMPLETE], "kind")}
     worst, least = max(kinds, key=lambda k: kinds[k][1]), min(kinds, key=lambda k: kinds[k][2])
     checked = (
@@ -101,16 +106,16 @@ def main() -> None:
     hours, pads, seeds = (0.25, 2, SEEDS[:1]) if asked.quick else (asked.hours, PADS, SEEDS)
     with ProcessPoolExecutor(asked.workers) as pool:
         running = {
-            (world, part): [pool.submit(used, world, part, hours, seed, pads) for seed in seeds]
+            (world, part): pool.submit(used, world, part, hours, seeds, pads, own_kinds(world))
             for world, part in PARTS
         }
         found = {}
-        for key, futures in running.items():
-            found[key] = concatenate([future.result() for future in futures])
+        for key, future in running.items():
+            found[key] = future.result()
             progress(f"sheets of {key[0]}, {key[1] or 'complete'}: {len(found[key])} contacts")
     tables = {"Goals": goals(found), "Forces": rows_of(found)}
     out = output_folder(asked.quick)
-    lines = table("Goals", "Of the world's own kinds of sheets.", tables["Goals"])
+    lines = table("Goals", "Of all sheets of the world, or of each kind.", tables["Goals"])
     lines += table("Forces", NOTE, tables["Forces"])
     title = f"# Force over {'a day' if math.isclose(hours, 24) else f'{hours:g} h'} on sheets"
     (out / "soak_sheets.md").write_text("\n".join([title, "", f"{made_by()}.", "", *lines]))
