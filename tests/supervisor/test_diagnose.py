@@ -443,10 +443,11 @@ def test_block_of_another_hand_is_refused() -> None:
         )
 
 
-def test_torn_corner_is_diagnosed_with_its_size() -> None:
+@pytest.mark.parametrize("series_ohm", [0.0, 500.0])
+def test_torn_corner_is_diagnosed_with_its_size(series_ohm: float) -> None:
     fault = {"kind": "torn_corner", "link": LINK, "from_s": 0.0, "corner": "x0yb"}
     fault |= {"along_x_mm": 17.0, "along_y_mm": 14.0}
-    (found,) = simulate(fault, 60)
+    (found,) = simulate(fault, 60, (series_ohm,) * 4)
     assert (found.kind, found.electrodes) == (FaultKind.TORN_CORNER, ("x0", "yb"))
     assert found.values["along_x_mm"] == pytest.approx(17, abs=5)
     assert found.values["along_y_mm"] == pytest.approx(14, abs=5)

@@ -1,7 +1,8 @@
 """Changes of the electrodes' current shares by cuts of the sheet: finite differences.
 
 Public: `SheetChanges`. The whole and the cut sheet are solved on one coarse grid of the rectangle; only
-their difference is used, in which most of the grid's error cancels. Resistors to ground are neglected.
+their difference is used, in which most of the grid's error cancels. The currents i of electrodes with series
+resistors R, at the shares f of grounded electrodes and the conductance G between them, are (1 + G R)^-1 f.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from handtouch.supervisor.diagnose.model import FloatArray
 
 _CELLS_PER_SIDE = 40  # a side
 _CUT_CONDUCTIVITY = 1e-9  # beyond the cut, relative
+_OPEN_OHM = 1e12
 _MIRRORED_ELECTRODES = np.array([0, 1, 3, 2, -1])  # electrodes with y reversed
 CORNERS = {("x0", "y0"): (0, 0), ("x0", "yb"): (0, 1), ("xa", "y0"): (1, 0), ("xa", "yb"): (1, 1)}
 
@@ -38,6 +40,7 @@ class SheetChanges:
         grid = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1)
         self._at = np.interp(grid[..., 0], along, arc), grid[..., 1]
         self._grid, self._nodes = grid, nodes
+        self._series_ohm = np.minimum(network.series_ohm, _OPEN_OHM)
         self._even = self._shares(lambda x, _: np.ones(x.shape))
 
     def by_cuts(
@@ -48,6 +51,7 @@ class SheetChanges:
         cuts: corner (0 or 1 along x, y), fractions of the sides. A cut is straight in arc length and angle.
         """
         symmetric = bool((_MIRRORED_ELECTRODES[self._owner[:, ::-1]] == self._owner).all())
+        symmetric &= bool((self._series_ohm[_MIRRORED_ELECTRODES[:4]] == self._series_ohm).all())
         computed: dict[tuple[int, float, float], FloatArray] = {}
         for cut in cuts:
             (right, _), along_x, along_y = cut
@@ -68,7 +72,10 @@ class SheetChanges:
         return np.asarray(RegularGridInterpolator((nodes, nodes), np.moveaxis(change, 0, -1))(self._grid))
 
     def _shares(self, conductivity: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
-        """Return potentials (4, nodes, nodes) with one electrode at 1: its share of a contact's current."""
+        """Return each electrode's share (4, nodes, nodes) of a contact's current.
+
+        With all electrodes grounded, it is the potential with that electrode at 1.
+        """
         x, y, n = self._x, self._y, len(self._x)
         index = np.arange(n * n).reshape(n, n)
         rows, columns, values = [], [], []
@@ -91,6 +98,9 @@ class SheetChanges:
         free = splu(laplacian[~held][:, ~held].tocsc()).solve(-(laplacian[~held][:, held] @ fixed))
         potentials = np.zeros((n * n, 4))
         potentials[held], potentials[~held] = fixed, free
+        if self._series_ohm.any():
+            conductance = potentials.T @ (laplacian @ potentials) / self._network.sheet_ohm_per_square
+            potentials = np.linalg.solve(np.eye(4) + conductance * self._series_ohm, potentials.T).T
         return potentials.T.reshape(4, n, n)
 
 
