@@ -7,6 +7,7 @@ docs/benchmarks/percept_grasp.{md,json}. Quick: --seeds 1 --objects ball.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import platform
@@ -128,17 +129,21 @@ def slips(
 ) -> dict[str, Any]:
     """Return delays [s] of alarms after onsets (inf: none), of the detector and of the rate of force.
 
-    Also the seconds of firm grip, and the alarms in them. An alarm has one of `labels` in a percept of one of
+    Also the seconds of firm grip, and the alarms in them; and the undetected slips that began while an alarm
+    stood. An alarm has one of `labels` in a percept of one of
     `kinds`, and is of an onset from `lead_s` before it on. on: links that count, by default all.
     """
     speed, links = speeds(run.grasp), [pad.link for pad in run.grasp.pads]
     alarms: list[list[float]] = [[] for _ in links]
     alarmed: list[set[str]] = [set() for _ in links]
+    ends: list[list[float]] = [[] for _ in links]
     for percept in run.percepts:
         if percept.kind not in kinds:
             continue
         row = links.index(percept.link)
         if percept.label not in labels:
+            if alarmed[row] == {percept.kind}:
+                ends[row].append((percept.t_ns - _START_NS) * 1e-9)
             alarmed[row].discard(percept.kind)
             continue
         if not alarmed[row]:
@@ -146,6 +151,7 @@ def slips(
         alarmed[row].add(percept.kind)
     by_rate = [_rates(run, row) for row in range(len(links))]
     found: dict[str, Any] = {"delays": [], "firm_s": 0.0, "false": 0, "rolls": 0, "between": 0, "late": 0}
+    found["standing"] = 0
     found |= {"rate_delays": [[] for _ in RATES_HZ], "rate_false": [0] * len(RATES_HZ), "short": 0}
     found |= {"kinds": [], "causes": Counter()}
     for row, pad in enumerate(run.grasp.pads):
@@ -175,6 +181,11 @@ def slips(
                 found["short"] += 1
                 continue
             found["delays"].append(_delay(onset * TIME_STEP_S, until, alarms[row], lead_s))
+            stands = any(
+                begin_s < onset * TIME_STEP_S - lead_s and end_s > onset * TIME_STEP_S
+                for begin_s, end_s in itertools.zip_longest(alarms[row], ends[row], fillvalue=np.inf)
+            )
+            found["standing"] += stands and not np.isfinite(found["delays"][-1])
             found["kinds"].append(_slip_kind(run, row, pad, speed[:, row], onset, round(until / TIME_STEP_S)))
             for number, rate in enumerate(RATES_HZ.tolist()):
                 found["rate_delays"][number].append(
@@ -380,6 +391,7 @@ def together(some: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "rolls": sum(of["rolls"] for of in some),
         "false_per_minute": false / minutes if minutes else np.nan,
         "between": sum(of["between"] for of in some),
+        "standing": sum(of["standing"] for of in some),
     }
 
 
@@ -443,6 +455,7 @@ def write(figures: dict[str, Any], seeds: int, out: Path) -> str:
     threshold, rate_false = f"{rate['threshold_per_s']:.0f}", f"{rate['false_per_minute']:.1f}"
     if_more = " and ".join(f"{of['found']:.0%} (median {of['ms']:.0f} ms)" for of in figures["rates"])
     rate_found, rate_ms = f"{rate['found']:.0%}", f"{rate['ms']:.0f}"
+    standing = figures["slip"]["**all**"]["standing"]
     on = f"MuJoCo {figures['mujoco']}, {platform.machine()}, Python {platform.python_version()}"
     stiffness_rows = "\n".join(
         f"| {name} | {of['squeezes']} | {of['estimated']} | "
@@ -483,7 +496,8 @@ before the contact ends.
 Intervals are 95 %; *ms*: delay of those detected, median and 95 %. *False*: during a grip, from 0.1 s
 before to 50 ms after the alarm; in parentheses, those with the centre of force moving on the pad by more
 than 0.2 mm in 0.1 s, as of a rolling finger. *Others*: during motion slower than a slip, or shortly before
-its end. A threshold on the rate of force, |dF/dt| / F > {threshold}
+its end. Of the slips in **all** that don't count as detected, {standing} began while an alarm, published more
+than 10 ms before, still stood. A threshold on the rate of force, |dF/dt| / F > {threshold}
 /s, set for at most as many false alarms ({rate_false} per minute), detects {rate_found}, median {rate_ms}
 ms; with {FALSE_PER_MINUTE[0]:.0f} and {FALSE_PER_MINUTE[1]:.0f} per minute, {if_more}. Many of these
 slips don't move the centroid: a ball or a rod pulled along under a fingertip keeps its contact position.

@@ -16,7 +16,7 @@ import matplotlib
 import numpy as np
 import numpy.typing as npt
 from page import made_by, options, output_folder, progress
-from scores import EventScore, Rate, score_events
+from scores import EventScore, Rate, Share, score_events
 from slip_runs import DEPLOYMENT, Record, pads_of, run
 
 from handtouch.simulate.grip_touch import GripTouch
@@ -38,12 +38,16 @@ LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
 SMOOTH_S = (0.0, 0.01, 0.03)
 BURST_MM = 0.1
+HOLD_HANDS, HOLD_S, HOLD_SLIPS, FAST_MM_PER_S = (31, 32), 125.0, 4, 10.0
+"""Hands of the reporting family in `default` for an hour of grips with chatter: length of the grips of each
+hand, and rounds of slips; speed from which the share found is stated."""
+ALARMS = ("incipient", "sliding")
 DEAD_S = 0.2  # alarms closer than that are one
 INK, FAINT, ACCENT = "#1a1a1a", "#8a8a8a", "#1f6fb4"
 Rows = list[dict[str, Any]]
 
 
-def slip_all(world: DrawnWorld, hz: float, repeats: int) -> Slips:
+def slip_all(world: DrawnWorld, hz: float, repeats: int, seed: int = 0) -> Slips:
     """Speed, force, record and pad of every slip; all speeds and forces go round all pads."""
     found = []
     for repeat in range(repeats):
@@ -55,7 +59,7 @@ def slip_all(world: DrawnWorld, hz: float, repeats: int) -> Slips:
                 from_s,
                 RUN_S,
                 force,
-                100 * repeat,
+                seed + 100 * repeat,
                 slip_mm_per_s=speed,
                 slip_from_s=from_s + SLIPS_S,
                 slip_load=LOADS[repeat % 2],
@@ -68,9 +72,9 @@ def slip_all(world: DrawnWorld, hz: float, repeats: int) -> Slips:
     return found
 
 
-def hold(world: DrawnWorld, hz: float, seconds: float, burst_mm: float = 0.0) -> Record:
+def hold(world: DrawnWorld, hz: float, seconds: float, burst_mm: float = 0.0, seed: int = 9000) -> Record:
     """A firm grip that doesn't slip; with bursts of chatter of 9 Hz and this amplitude."""
-    grips = [grip(k, 0.0, seconds + 1, FORCES[k % 3], 9000, burst_mm=burst_mm) for k in range(len(PADS))]
+    grips = [grip(k, 0.0, seconds + 1, FORCES[k % 3], seed, burst_mm=burst_mm) for k in range(len(PADS))]
     return run(grips, world, hz, seconds)
 
 
@@ -151,7 +155,14 @@ def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: Floa
 
 def measure(quick: bool, out: Path) -> dict[str, Any]:
     seconds, burst_s = (10.0, 10.0) if quick else (20.0, 80.0)
-    results: dict[str, Any] = {"worlds": [], "latency": [], "curves": {}, "cost": []}
+    results: dict[str, Any] = {
+        "worlds": [],
+        "latency": [],
+        "curves": {},
+        "cost": [],
+    }
+    results["chatter"] = chatter(quick)
+    progress(f"{results['chatter']}")
     for name, hz in CASES[: 3 if quick else None]:
         repeats = 2 if quick or hz > 200 else 4
         made, firm = slip_all(DRAWN[name], hz, repeats), hold(DRAWN[name], hz, min(seconds, 5e3 / hz))
@@ -177,6 +188,34 @@ def measure(quick: bool, out: Path) -> dict[str, Any]:
         progress(f"{results['worlds'][-1]}")
         keep(results, out)
     return results
+
+
+def chatter(quick: bool) -> dict[str, Any]:
+    """Return false alarms of an hour of grips with tremor and chatter in `default`, and fast slips found.
+
+    Also the false alarms of published percepts that are `incipient` only.
+    """
+    hours, false, published, slips, found = 0.0, 0, 0, 0, 0
+    for number in HOLD_HANDS[:1] if quick else HOLD_HANDS:
+        world = WORLDS["default"].draw(Family.REPORTING.seed(number))
+        held = hold(world, 200.0, 5.0 if quick else HOLD_S, BURST_MM, 1000 * number)
+        alarms, _ = false_alarms(held)
+        hours, false, published = hours + alarms.hours, false + alarms.count, published + percept_alarms(held)
+        made = slip_all(world, 200.0, 1 if quick else HOLD_SLIPS, 1000 * number + 500)
+        recall = slip_score([slip for slip in made if slip[0] >= FAST_MM_PER_S]).recall
+        slips, found = slips + recall.total, found + recall.count
+    return {"minutes": 60 * hours, "false": false, "published": published, "slips": slips, "found": found}
+
+
+def percept_alarms(firm: Record) -> int:
+    """Return how often a percept became `incipient` or `sliding`, from a second after the grip closed."""
+    count, alarmed = 0, set[str]()
+    for percept in firm.percepts:
+        raised = percept.label in ALARMS
+        late = (percept.t_ns - 10**9) * 1e-9 > GRIPPED_S + 1.0
+        count += raised and late and percept.link not in alarmed
+        (alarmed.add if raised else alarmed.discard)(percept.link)
+    return count
 
 
 def false_alarms(firm: Record) -> tuple[Rate, int]:
@@ -324,6 +363,15 @@ def report(results: dict[str, Any]) -> str:
         ]
         for row in results["latency"]
     ]
+    held = results["chatter"]
+    hour = {
+        "contact minutes": f"{held['minutes']:.0f}",
+        "false alarms": str(held["false"]),
+        "per hour": str(Rate(held["false"], held["minutes"] / 60)),
+        "percepts": str(held["published"]),
+        "slips": str(held["slips"]),
+        "found, %": str(Share(held["found"], held["slips"])),
+    }
     worlds = [[str(cell) for cell in row.values()] for row in results["worlds"]]
     roc = [
         [slips, name, f"{row['false_per_min']:.2f}", f"{100 * row['found']:.0f} %", f"{row['median_ms']:.0f}"]
@@ -357,6 +405,17 @@ counts once it has moved farther than such chatter does, 0.35 mm or 8 mm/s, whic
 Shares in %, rates per hour of a contact, with 95 % intervals.
 
 {table([*results["worlds"][0]], worlds)}
+
+## An hour of chatter
+
+{len(HOLD_HANDS)} other hands of `default` at 200 Hz hold {len(PADS)} grips each with tremor and these bursts.
+Then such grips, without bursts, slip at {FAST_MM_PER_S:g} mm/s and faster; found: within {LATEST_S:g} s of
+the onset.
+
+{table([*hour], [[*hour.values()]])}
+
+*Percepts*: times that a published percept became `incipient` or `sliding`, without joint states; `incipient`
+has a lower threshold than the alarm.
 
 ## From onset to alarm
 

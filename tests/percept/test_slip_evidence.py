@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.evidence import ALONE_LOG_ODDS, SLIP_FEATURES
+from handtouch.core.stages.evidence import (
+    ALONE_LOG_ODDS,
+    MAX_OTHERS_LOG_ODDS,
+    OTHERS_WEIGHT,
+    SLIP_FEATURES,
+)
 from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.percept.samples import ContactBuffer, ContactSamples
@@ -203,8 +208,8 @@ def test_motion_against_other_contacts_is_that_of_least_squares() -> None:
     assert compared > 300
 
 
-def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
-    """The odds of a hand's only contact are higher by a constant."""
+def test_odds_sum_the_evidence_of_a_hand_and_decay_by_one_in_50_ms() -> None:
+    """Those of a hand's other contacts count with a weight; the odds of an only contact are higher."""
     hands = RandomHands(missing=0.4)
     evidence, expected = SlipEvidence(hands.buffer, hands.slip, PERIOD_S), np.full(RandomHands.PADS, np.nan)
     updated_ns = np.zeros(RandomHands.PADS, np.int64)
@@ -217,8 +222,14 @@ def test_odds_are_those_of_the_trees_and_decay_by_one_in_50_ms() -> None:
         passed_s = (now_ns - updated_ns[due]) * 1e-9
         kept = np.nan_to_num(expected[due], nan=-50.0) - passed_s / 0.05
         own = SlipEvidence(hands.buffer, hands.slip, PERIOD_S).features(due)
-        contacts = np.bincount(hands.buffer.hand_index[due])[hands.buffer.hand_index[due]]
-        found = SlipTrees.shipped().log_odds(own) + ALONE_LOG_ODDS * (contacts == 1)
+        found = SlipTrees.shipped().log_odds(own)
+        hand, alone = hands.buffer.hand_index[due], found + ALONE_LOG_ODDS
+        for row in range(len(due)):
+            others = found[(hand == hand[row]) & (due != due[row])]
+            if len(others):
+                limited = np.clip(others.mean(), -MAX_OTHERS_LOG_ODDS, MAX_OTHERS_LOG_ODDS)
+                alone[row] = found[row] + OTHERS_WEIGHT * limited
+        found = alone
         expected[due] = np.maximum(found, kept)
         updated_ns[due] = now_ns
         assert evidence.log_odds == pytest.approx(expected, rel=1e-9, abs=1e-9, nan_ok=True)

@@ -4,7 +4,9 @@ A centroid moves on a pad when its contact slips, but also when the link rolls o
 shifts to another part of the pad. Joint states distinguish these: a link that rolls turns, and its surface
 moves with the object. `SLIP_FEATURES` are what is known of each contact over windows of 10 to 100 ms, and
 `SlipTrees`, boosted decision trees with the same test for all nodes of a level (A. Gulin et al. 2011,
-"Winning the transfer learning track of Yahoo!'s Learning to Rank challenge with YetiRank"), the odds of slip.
+"Winning the transfer learning track of Yahoo!'s Learning to Rank challenge with YetiRank"), sum the evidence.
+A rigid object slips under several contacts at once, so the odds of slip of a contact are its own sum plus a
+part of the mean of the hand's other contacts.
 benchmarks/train_slip.py trains them with simulated grasps of the tuning family.
 
 Public names: `SlipEvidence`, `SlipTrees`, `FEATURE_WINDOW_S`.
@@ -75,6 +77,7 @@ class SlipEvidence:
             view_memory(self._evidence_ns),
             view_memory(np.full((n, 3), np.nan)),
             view_memory(np.full(n, np.nan)),
+            view_memory(np.zeros(n)),
             view_memory(np.zeros((n, 3))),
             view_memory(np.zeros(n, np.intp)),
             view_memory(np.zeros(EVIDENCE_WORK)),
@@ -123,7 +126,7 @@ class SlipTrees:
         return _shipped()
 
     def log_odds(self, features: FloatArray) -> FloatArray:
-        """Return ln of the odds of slip (k,) of contacts with features (k, len(SLIP_FEATURES))."""
+        """Return the sum of leaves (k,) of contacts with features (k, len(SLIP_FEATURES))."""
         above = features[:, self.features] > self.thresholds  # NaN is not
         leaf = above @ (1 << np.arange(self.features.shape[1]))
         return np.asarray(self.values[np.arange(len(self.values)), leaf].sum(axis=1))

@@ -14,14 +14,14 @@ cdef double _MAX_LOG_RATIO, _MIN_LOG_RATIO, _MIN_FORCE_N, _CONTACT_VARIANCE_M2
 cdef double _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S, _MAX_HOLDING_LOG_RATIO, _LINK_SPEED_STD_M_PER_S
 cdef double _MAX_STICKING_LOG_ODDS
 cdef Py_ssize_t _UPDATE_NS
-cdef double _ALONE_LOG_ODDS, _MIN_LOG_ODDS, _ODDS_DECAY_S, _MIN_PIVOT, _NAN, _INFINITY
+cdef double _ALONE_LOG_ODDS, _OTHERS_WEIGHT, _MAX_OTHERS_LOG_ODDS, _MIN_LOG_ODDS, _ODDS_DECAY_S, _MIN_PIVOT, _NAN, _INFINITY
 cdef Py_ssize_t _MOTION, _INFORMATION, _WEIGHTED, _FACTOR, _BODY, _POINT, _OFF
 
 cdef class EvidenceStage:
-    cdef double[::1] history, windows, slip, thresholds, leaves, features, log_odds, ways, work, velocities, velocity_std
+    cdef double[::1] history, windows, slip, thresholds, leaves, features, log_odds, ways, work, velocities, velocity_std, own_odds
     cdef Py_ssize_t[::1] sample_count, offsets, steps, hands, tested, evidence_ns, due, sample_ns
     cdef Py_ssize_t length, width, levels, trees
-    @cython.locals(count=Py_ssize_t, k=Py_ssize_t, pad=Py_ssize_t, waits=bint, before=bint, after=bint)
+    @cython.locals(count=Py_ssize_t, k=Py_ssize_t, pad=Py_ssize_t, waits=bint, first=Py_ssize_t, stop=Py_ssize_t)
     cpdef update_odds(self, Py_ssize_t[::1] pads, Py_ssize_t now_ns)
     @cython.locals(pad=Py_ssize_t)
     cpdef compute_velocities(self, Py_ssize_t now_ns)
@@ -30,6 +30,8 @@ cdef class EvidenceStage:
     cpdef bint compare_to_object(self, Py_ssize_t pad, double[::1] out)
     cpdef compute_features(self, Py_ssize_t[::1] pads)
 
+cdef void _update_contact(
+    EvidenceStage stage, Py_ssize_t pad, Py_ssize_t others, double total, Py_ssize_t now_ns) noexcept
 @cython.locals(at=Py_ssize_t)
 cdef bint _is_placed(EvidenceStage stage, Py_ssize_t pad) noexcept
 @cython.locals(last=Py_ssize_t)

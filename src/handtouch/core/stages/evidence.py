@@ -1,7 +1,10 @@
 """Evidence of slip by joint states: features of contacts on moving links, and boosted trees that sum it.
 
+Contacts on one rigid object slip together, and each shows it in its own way, so the odds of a contact include
+the evidence of the hand's other contacts.
+
 Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`, `EVIDENCE_WORK`,
-`ALONE_LOG_ODDS`.
+`ALONE_LOG_ODDS`, `OTHERS_WEIGHT`, `MAX_OTHERS_LOG_ODDS`.
 """
 
 from __future__ import annotations
@@ -45,8 +48,10 @@ EVIDENCE_FIELDS = (
 )  # fmt: skip
 """Fields of samples that features are computed from, in the order of `EvidenceStage.offsets`."""
 
-ALONE_LOG_ODDS = 2.5
+ALONE_LOG_ODDS = 1.5
 """Added to ln of the odds of a hand's only contact: nothing else holds the object there."""
+OTHERS_WEIGHT, MAX_OTHERS_LOG_ODDS = 0.8, 4.0
+"""Weight of the mean of the trees' sums of a hand's other contacts, limited to +-MAX_OTHERS_LOG_ODDS."""
 
 _COUNT, _WINDOWS, _LINK_WINDOWS, _HAND_WINDOWS = len(SLIP_FEATURES), 4, 3, 2
 _LOG_RATIO, _SLIPPING, _SPEED, _ONSET_AGE, _FORCE_RATE = 0, 1, 2, 3, 4
@@ -83,7 +88,7 @@ _VELOCITY_WINDOW, _MAX_AGE_NS = 2, 50_000_000
 _MAX_STICKING_LOG_ODDS = -3.0  # ln of the odds of slip below which a contact holds the object
 _MAX_HOLDING_LOG_RATIO = 3.0  # ln R of a contact that counts as sticking to the object
 _UPDATE_NS = 4_500_000
-_ALONE_LOG_ODDS = ALONE_LOG_ODDS
+_ALONE_LOG_ODDS, _OTHERS_WEIGHT, _MAX_OTHERS_LOG_ODDS = ALONE_LOG_ODDS, OTHERS_WEIGHT, MAX_OTHERS_LOG_ODDS
 _MIN_LOG_ODDS, _ODDS_DECAY_S = -50.0, 0.05  # evidence of slip decays by 1 in that time
 _MIN_PATH_M, _MIN_CURRENT_VARIANCE = 1e-8, 1e-6
 _MIN_PIVOT = 1e-6  # information is that of the prior at least, 1e3 and more
@@ -104,8 +109,8 @@ class EvidenceStage:
 
     Results: features (n SLIP_FEATURES,); log_odds (n,) of slip, NaN where unknown, and the times
     evidence_ns (n,) of the last update; velocities (n 3,) [m/s] of links at contacts in the palm, with the
-    deviation of a component in velocity_std (n,), NaN where unknown. ways: (n 3,), due: (n,), work:
-    (EVIDENCE_WORK,), working memory.
+    deviation of a component in velocity_std (n,), NaN where unknown. own_odds: (n,), the trees' sums of the
+    last update. ways: (n 3,), due: (n,), work: (EVIDENCE_WORK,), working memory.
     """
 
     def __init__(
@@ -129,6 +134,7 @@ class EvidenceStage:
         evidence_ns: memoryview[int],
         velocities: memoryview[float],
         velocity_std: memoryview[float],
+        own_odds: memoryview[float],
         ways: memoryview[float],
         due: memoryview[int],
         work: memoryview[float],
@@ -141,7 +147,7 @@ class EvidenceStage:
         self.trees = len(tested) // levels
         self.features, self.log_odds, self.evidence_ns = features, log_odds, evidence_ns
         self.velocities, self.velocity_std = velocities, velocity_std
-        self.ways, self.due, self.work = ways, due, work
+        self.own_odds, self.ways, self.due, self.work = own_odds, ways, due, work
 
     def update_odds(self, pads: memoryview[int], now_ns: int) -> None:
         """Update the odds of slip of the contacts on these pads, ascending, by samples up to `now_ns`.
@@ -162,17 +168,16 @@ class EvidenceStage:
         if waits:
             return
         _compute_features(self, self.due, count)
-        for k in range(count):
-            pad = self.due[k]
-            found = _sum_trees(self, pad)
-            before = k > 0 and self.hands[self.due[k - 1]] == self.hands[pad]
-            after = k + 1 < count and self.hands[self.due[k + 1]] == self.hands[pad]
-            if not before and not after:
-                found += _ALONE_LOG_ODDS
-            last = self.log_odds[pad] if self.log_odds[pad] > _MIN_LOG_ODDS else _MIN_LOG_ODDS
-            kept = last - (now_ns - self.evidence_ns[pad]) * 1e-9 / _ODDS_DECAY_S
-            self.log_odds[pad] = found if found > kept else kept
-            self.evidence_ns[pad] = now_ns
+        first = 0
+        while first < count:
+            stop, total = first, 0.0
+            while stop < count and self.hands[self.due[stop]] == self.hands[self.due[first]]:
+                self.own_odds[self.due[stop]] = _sum_trees(self, self.due[stop])
+                total += self.own_odds[self.due[stop]]
+                stop += 1
+            for k in range(first, stop):
+                _update_contact(self, self.due[k], stop - first - 1, total, now_ns)
+            first = stop
 
     def compute_velocities(self, now_ns: int) -> None:
         """Compute the velocities of links at all contacts that have a sample in the last 50 ms."""
@@ -216,6 +221,24 @@ class EvidenceStage:
     def compute_features(self, pads: memoryview[int]) -> None:
         """Compute the features of the contacts on these pads alone."""
         _compute_features(self, pads, len(pads))
+
+
+def _update_contact(stage: EvidenceStage, pad: int, others: int, total: float, now_ns: int) -> None:
+    """Update a contact's odds by those of its own and of its hand's `others`, with their sum `total`."""
+    found = stage.own_odds[pad]
+    if others == 0:
+        found += _ALONE_LOG_ODDS
+    else:
+        mean = (total - found) / others
+        if mean > _MAX_OTHERS_LOG_ODDS:
+            mean = _MAX_OTHERS_LOG_ODDS
+        elif mean < -_MAX_OTHERS_LOG_ODDS:
+            mean = -_MAX_OTHERS_LOG_ODDS
+        found += _OTHERS_WEIGHT * mean
+    last = stage.log_odds[pad] if stage.log_odds[pad] > _MIN_LOG_ODDS else _MIN_LOG_ODDS
+    kept = last - (now_ns - stage.evidence_ns[pad]) * 1e-9 / _ODDS_DECAY_S
+    stage.log_odds[pad] = found if found > kept else kept
+    stage.evidence_ns[pad] = now_ns
 
 
 def _is_placed(stage: EvidenceStage, pad: int) -> bool:
