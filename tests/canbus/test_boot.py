@@ -12,6 +12,7 @@ from handtouch.canbus.nodes.boot import (
     Identity,
     IdleSettings,
     check_identity,
+    check_settings,
     configure_node,
     read_identity,
 )
@@ -375,3 +376,45 @@ def test_cancelled_step_sends_no_more_requests() -> None:
     node.sdo.is_cancelled = lambda: True
     with pytest.raises(BootStepCancelled):
         read_identity(node.sdo)
+
+
+def test_a_schedule_is_written_to_the_tpdos_of_its_states_while_they_are_disabled() -> None:
+    objects = {(0x1017, 0): (100, 2), (0x1019, 0): (0, 1)}
+    tpdos = []
+    for number in (2, 3):
+        index, cob_id = 0x1800 + number - 1, 0x85 + 0x100 * number
+        objects |= {
+            (index, 1): (cob_id, 4),
+            (index, 2): (1, 1),
+            (index, 6): (0, 1),
+            (index + 0x200, 0): (0, 1),
+        }
+        tpdos.append(NodeTpdo(number, cob_id, True, 1, ()))
+    node = Node(objects)
+    mapping = PdoMapping(tuple(tpdos), STANDARD_LAYOUT, (0, 1))
+    configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2)
+    assert node.objects[0x1019, 0][0] == 2
+    for number, state in ((2, 0), (3, 1)):
+        index = 0x1800 + number - 1
+        assert (node.objects[index, 2][0], node.objects[index, 6][0]) == (2, state + 1)
+        writes = [(sub, value) for at, sub, value in node.writes if at == index]
+        start = writes.index((6, state + 1))
+        assert writes[start - 1] == (1, 0x80000085 + 0x100 * number)
+        assert writes[start + 1] == (1, 0x85 + 0x100 * number)
+    check_settings(node.sdo, mapping, 100, event_driven=False)
+    node.objects[0x1802, 6] = (1, 1)  # as of another state
+    with pytest.raises(BootStepError, match="SYNC start value of TPDO3, is 1 instead of 2"):
+        check_settings(node.sdo, mapping, 100, event_driven=False)
+
+
+def test_a_node_that_does_not_count_syncs_has_no_schedule() -> None:
+    node = Node({(0x1017, 0): (100, 2)})
+    mapping = PdoMapping((found(),), STANDARD_LAYOUT, (0,))
+    with pytest.raises(BootStepError, match="no 0x1019, SYNC counter overflow"):
+        configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2)
+
+
+def test_others_on_the_bus_of_a_schedule_may_lack_the_counter() -> None:
+    node = Node({(0x1017, 0): (100, 2)})
+    mapping = PdoMapping((found(),), STANDARD_LAYOUT)
+    assert not configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2).refusal

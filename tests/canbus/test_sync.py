@@ -374,3 +374,21 @@ def test_jitter_is_the_deviation_from_the_period(deviations: list[int]) -> None:
     assert figures["max"] == pytest.approx(max(recent) * 1e-3)
     assert 0 <= figures["p50"] <= figures["p99"] <= figures["max"]
     assert jitter.percentiles_us(t_ns + 1_100_000_000) == {}
+
+
+def test_a_bus_with_schedules_has_a_counter_in_sync_that_the_loop_sends() -> None:
+    sent: list[bytes] = []
+
+    class Counted(Kernel):
+        def send(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
+            assert can_id == cia301.SYNC
+            sent.append(data)
+
+    kernel = Counted()
+    port = Port(Bus(name="can0", interface="virtual", channel="0"), kernel, Slab(1))
+    sync = Sync([port], P, {"can0": 3})
+    sync.start(T0)
+    for cycle in range(5):
+        assert sync.poll(T0 + cycle * P, T0 + cycle * P)
+    assert sent == [b"\1", b"\2", b"\3", b"\1", b"\2"]
+    assert kernel.started == 0

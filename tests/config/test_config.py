@@ -81,7 +81,9 @@ DEPLOYMENTS = [path for path in sorted(CONFIG.glob("*.toml")) if "\n[[hand]]\n" 
 @pytest.mark.parametrize("path", DEPLOYMENTS, ids=lambda path: path.name)
 def test_shipped_deployments_are_valid(path: Path) -> None:
     deployment = config.load(path)
-    pads = {"two_finger": 2, "electrodes": 2, "outlined": 3, "shear": 2, "l_palm": 1}.get(path.stem, 15)
+    pads = {"two_finger": 2, "electrodes": 2, "switched": 2, "outlined": 3, "shear": 2, "l_palm": 1}.get(
+        path.stem, 15
+    )
     assert [len(hand.pads) for hand in deployment.hands] == [pads]
 
 

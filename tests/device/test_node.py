@@ -293,3 +293,22 @@ def test_nodes_on_a_real_bus_work_with_the_librarys_master() -> None:
             nodes.stop()
             network.notifier.stop()
     assert nodes.bus_errors == 0
+
+
+def test_tpdos_of_a_schedule_are_sent_at_their_counts_of_sync_even_after_a_lost_one(bench: Any) -> None:
+    channels = tuple((0x6401, sub) for sub in range(1, 9))
+    bench.counts = np.arange(8)[None]
+    node = bench.bus.add(1, channels=channels)
+    node.plug()
+    for index, sub, value in ((0x1019, 0, 2), (0x1801, 6, 1), (0x1801, 2, 2), (0x1802, 6, 2), (0x1802, 2, 2)):
+        node.write_object(index, sub, value)
+    for number in (2, 3):
+        node.write_object(0x1800 + number - 1, 1, 0x81 + 0x100 * number)
+    bench.nmt(1, 1)
+    bench.take()
+    sent = []
+    for counter in (1, 2, 2, 1, 1, None):
+        data = b"" if counter is None else bytes((counter,))
+        bench.bus.handle_frame(can.Message(arbitration_id=0x80, data=data, is_extended_id=False), bench.t_ns)
+        sent.append([identifier for identifier, _ in bench.take()])
+    assert sent == [[0x281], [0x381], [0x381], [0x281], [0x281], []]

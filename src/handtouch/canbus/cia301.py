@@ -40,12 +40,17 @@ HEARTBEAT_TIME = 0x1017
 IDENTITY = 0x1018
 """Sub-indices 1 to 4: vendor id, product code, revision, serial number."""
 SERIAL_SUB = 4
+SYNC_OVERFLOW = 0x1019
+"""Synchronous counter overflow value: SYNC carries a counter from 1 to it; 0: no counter."""
 ERROR_BEHAVIOUR = 0x1029
 """Sub-index 1: reaction to a communication error."""
 ERROR_REACTIONS = {0: "pre-operational", 1: "no change", 2: "stopped"}
 """Values of 0x1029: the NMT state that a node enters by itself upon an error."""
 TPDO_COMMUNICATION = 0x1800
-"""Sub-indices 1 to 5: identifier, transmission type, inhibit time, (reserved), event timer."""
+"""Sub-indices 1 to 5: identifier, transmission type, inhibit time, (reserved), event timer, SYNC
+start value."""
+SYNC_START_SUB = 6
+"""Counter of the first SYNC that a TPDO with a counter counts its transmission type from."""
 TPDO_MAPPING = 0x1A00
 MAX_TPDOS = 512
 PREDEFINED_TPDOS = 4

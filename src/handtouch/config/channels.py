@@ -3,7 +3,7 @@
 A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
 Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `PROFILE_TYPES`,
-`resolve_channels`, `order_by_electrode`, `order_channels`, `shear_numbers`, `parse_object`,
+`resolve_channels`, `order_by_electrode`, `order_channels`, `channel_states`, `shear_numbers`, `parse_object`,
 `parse_writable_object`, `full_scale_counts`,
 `max_count`, `integer_limits`.
 """
@@ -159,6 +159,16 @@ def order_by_electrode(channels: Channels, pad: Pad) -> Channels:
 def order_channels(channels: Channels, pad: Pad) -> Channels:
     """Return the channels of a pad's electrodes, then those of its shear pad's x0, xa, y0, yb."""
     return *order_by_electrode(channels, pad), *(channels[number] for number in shear_numbers(pad))
+
+
+def channel_states(pad: Pad) -> tuple[int, ...]:
+    """Return the state of `switch_states` in which each electrode's channel is measured; () without."""
+    if not pad.switch_states:
+        return ()
+    return tuple(
+        next(number for number, state in enumerate(pad.switch_states) if name in state)
+        for name in pad.electrode_names
+    )
 
 
 def shear_numbers(pad: Pad) -> tuple[int, ...]:

@@ -57,6 +57,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             in_wrong_unit = list(pad_unit_problems(location, pad))
             yield from in_wrong_unit or _check_shape(location, pad)
             yield from _check_electrodes(location, pad, deployment)
+            yield from _check_schedule(location, pad, deployment)
             yield from _check_shear_pad(location, pad)
             if pad.touch:
                 yield from _check_touch(f"{location}touch.", pad.touch)
@@ -297,6 +298,32 @@ def _check_electrodes(location: str, pad: Pad, deployment: Deployment) -> Iterat
             f"has {len(node.channels)} channels, the pad {len(names)} electrodes{shear}; list as many "
             f"objects in channels of [node.{pad.node}], or of a kind of node for this pad",
         )
+
+
+def _check_schedule(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
+    """Check that each electrode of a schedule is in one state, and that nothing else excludes a schedule."""
+    if not pad.switch_states:
+        return
+    key, value = f"{location}switch_states", _format_value(pad.switch_states)
+    if pad.electrode_arcs_mm is None:
+        remedy = "names electrodes of electrode_arcs_mm, which the pad lacks; add it, or leave this out"
+        yield Problem(key, value, remedy)
+        return
+    if sorted(name for state in pad.switch_states for name in state) != sorted(pad.electrode_names):
+        yield Problem(key, value, f"must name each of {', '.join(pad.electrode_names)} in one state")
+    elif len({len(state) for state in pad.switch_states}) > 1:
+        remedy = "electrodes at the same place of every state share a channel; name as many in each state"
+        yield Problem(key, value, remedy)
+    if pad.shear is not None:
+        remedy = "a pad with a shear pad beneath it has no schedule; leave out shear or switch_states"
+        yield Problem(key, value, remedy)
+    node = deployment.nodes.get(pad.node)
+    if node is not None and node.idle is not None:
+        remedy = (
+            f"its samples follow SYNC, but [node.{pad.node}.idle] makes the node event-driven; leave that "
+            "out, or give the pad a kind of node without it"
+        )
+        yield Problem(key, value, remedy)
 
 
 def _check_shear(location: str, shear: Shear) -> Iterator[Problem]:

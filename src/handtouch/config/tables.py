@@ -35,6 +35,8 @@ Electrode = Literal["x0", "xa", "y0", "yb"]
 SIDE_ELECTRODES: tuple[Electrode, ...] = ("x0", "xa", "y0", "yb")
 _PerChannel = Field(strict=False, min_length=MIN_ELECTRODES, max_length=MAX_ELECTRODES)
 PositivePerChannel = Annotated[tuple[Positive, ...], _PerChannel]
+MAX_STATES = 4
+SwitchState = Annotated[tuple[Name, ...], _PerChannel]
 Arc = Annotated[tuple[float, float], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -386,6 +388,16 @@ class Pad(Table):
         "each other counter-clockwise, each with the part of the outline that it covers, less gap_mm at both "
         "ends: lengths along it from the first vertex; default: one electrode between each two of corners_mm",
     )
+    switch_states: tuple[SwitchState, ...] | None = Field(
+        None,
+        strict=False,
+        min_length=2,
+        max_length=MAX_STATES,
+        description="of a pad with electrode_arcs_mm whose node connects its electrodes in turn, one group "
+        "of them in each SYNC period: for each state the names of the electrodes that are connected, each "
+        "electrode in one state; those at the same place of every state share a channel. The contact is "
+        "estimated from the samples of all states; default: all are connected all the time",
+    )
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: PadSurface = Field(description="shape of the sensing surface")
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
@@ -440,6 +452,12 @@ class Pad(Table):
     def arcs_mm(self) -> tuple[tuple[float, float], ...]:
         """Begin and end [mm] of each electrode of `electrode_arcs_mm`: (n, 2); empty without."""
         return tuple((self.electrode_arcs_mm or {}).values())
+
+    @property
+    def state_numbers(self) -> tuple[tuple[int, ...], ...]:
+        """Numbers of the electrodes in each state of `switch_states`: (states, k); empty without."""
+        names = self.electrode_names
+        return tuple(tuple(map(names.index, state)) for state in self.switch_states or ())
 
     @property
     def gaps_mm(self) -> tuple[tuple[float, float], ...]:

@@ -44,18 +44,19 @@ def make_solver(
     parts: (pads, PARTS_COUNT), twice PART_SLICES.
     """
     n, points = currents.shape[1], grid_points(SEARCH_POINTS)
+    most = int(model.state_counts.max())
     limits, moments = model.pair_settings()
     if parts is None:
         parts = np.full((model.size, PARTS_COUNT), np.nan)
     raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
     whitening = Whitening(
-        *(_work(n * n), _work(n), _work(n), _work(10 * n), _work(part_count(n) * n), _work(n), n)
+        *(_work(n * n), _work(n), _work(n), _work((8 + 2 * most) * n), _work(part_count(n) * n), _work(n), n)
     )
     fit = Fit(
         _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening
     )
     return ContactSolver(
-        [table.pad_table() for table in model.forward_tables],
+        model.stage_tables(),
         model.stage_tolerances(),
         model.stage_laws(),
         [surface.pad_surface() for surface in model.surface_tables],

@@ -27,6 +27,7 @@ from handtouch.core.part_tolerances import stage_tolerances
 from handtouch.core.shear import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
+from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field import LocatorBank
 from handtouch.field.contact_law import ContactLaw, ForceEstimate
@@ -64,6 +65,7 @@ class PadModel:
     c) are standard deviations of a channel. The counts of untouched pads are state of the tick: see
     `Baseline`.
 
+    `state_counts` (n,): numbers of states of a schedule, 1 where electrodes aren't switched.
     `gain_covariance` (n, c, c) is that of log gains; `part_axes` (n, (c + p)^2), `part_axis_ends` (n, c + p),
     `part_offsets` (n, p) and `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is
     published; `position_unreliable` (n,).
@@ -119,8 +121,12 @@ class PadModel:
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = self._used.astype(np.float64)
+        self.state_counts = np.array([len(pad.switch_states or (0,)) for pad in pads])
         self._stated_gain_covariance = np.stack(
-            [node.gain_std**2 * np.diag(gains) for node, gains in zip(nodes, self.gains, strict=True)]
+            [
+                node.gain_std**2 * _shared_channels(pad, self.channels)
+                for node, pad in zip(nodes, pads, strict=True)
+            ]
         )
         self.gain_covariance = self._stated_gain_covariance.copy()
         self.touch_errors = np.zeros(self.size)
@@ -393,6 +399,11 @@ class PadModel:
         columns = zip(self._parts, self.networks, self.forward_tables, strict=True)
         return [stage_tolerances(*parts, network, table) for parts, network, table in columns]
 
+    def stage_tables(self) -> list[ModelTable]:
+        """Return the forward models as the stages take them."""
+        pads = zip(self.forward_tables, self.state_counts.tolist(), strict=True)
+        return [table.pad_table(states) for table, states in pads]
+
     def pair_settings(self) -> FloatArray:
         """Return the limit (n,) of one contact's squared misfit beyond which two are tried, and the deviation
         (n,) [m^2] of half the difference of the variances of an elongated contact's current, (2, n).
@@ -401,8 +412,10 @@ class PadModel:
         """
         sheets = [sheet for _, _, sheet in self._parts]
         limits = [
-            pair_limit(table, sheet.pair_false_alarm)
-            for table, sheet in zip(self.forward_tables, sheets, strict=True)
+            pair_limit(table, sheet.pair_false_alarm, states)
+            for table, sheet, states in zip(
+                self.forward_tables, sheets, self.state_counts.tolist(), strict=True
+            )
         ]
         return np.array([limits, [(1e-3 * sheet.max_contact_length_mm) ** 2 / 24 for sheet in sheets]])
 
@@ -463,10 +476,19 @@ def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channel
     """Return the current per count of the electrodes."""
     node = deployment.nodes[pad.node]
     scale = [node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names]
+    states = len(pad.switch_states or (0,))  # the sum of all currents is the mean of those of the states
     return [
-        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor
+        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor / states
         for channel, factor in zip(order_by_electrode(channels, pad), scale, strict=True)
     ]
+
+
+def _shared_channels(pad: config.Pad, channels: int) -> FloatArray:
+    """Return a matrix (channels, channels), 1 for each two electrodes that share an amplifier, else 0."""
+    shared = np.diag((np.arange(channels) < len(pad.electrode_names)).astype(np.float64))
+    for electrodes in zip(*pad.state_numbers, strict=True):
+        shared[np.ix_(electrodes, electrodes)] = 1.0
+    return shared
 
 
 def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
@@ -481,7 +503,10 @@ def networks_of(deployment: Deployment) -> list[RectangleNetwork]:
     networks = []
     for _, pad in deployment.pads:
         sheet = deployment.sheets[pad.sheet]
-        parameters = (pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square)
+        parameters = (
+            *(pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square),
+            pad.state_numbers,
+        )
         if parameters not in shared:
             shared[parameters] = pad_network(pad, sheet)
         networks.append(shared[parameters])
@@ -517,6 +542,7 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     """
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     absent = {"shear", "shear_electrodes"} | (set() if pad.arcs_mm else {"electrode_arcs_mm"})
+    absent |= set() if pad.switch_states else {"switch_states"}
     text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
     unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if sheet.hertz_force_n is None else set())
     text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=unstated)

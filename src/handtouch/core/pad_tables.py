@@ -26,6 +26,7 @@ from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import spreading_radius
 from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import unevenness_slopes
 
@@ -82,10 +83,11 @@ class ForwardTable:
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
     `ModelTable`.
 
-    tolerance_nodes: (37, 37, 4, 10 n), on every third node, in single precision: fields of the 2 n ends of
-    electrodes, and derivatives of the fractions by the logarithm of a / b, by waves of the sheet resistance,
-    and second ones by x x and x y, see `PadTolerances`. end_vectors: (2 n, n), derivatives of the fractions
-    by the bare length at each end, two of each electrode, per its field.
+    tolerance_nodes: (37, 37, 4, (8 + 2 s) n), on every third node, in single precision: fields of the 2 n
+    ends of electrodes in each of s states of a schedule, 1 without, and derivatives of the fractions by the
+    logarithm of a / b, by waves of the sheet resistance, and second ones by x x and x y, see
+    `PadTolerances`. end_vectors: (2 n, n), derivatives of the fractions by the bare length at each end, two
+    of each electrode, per its field.
     series_vectors: (n, n), by the logarithm of each resistor, per its electrode's fraction.
     """
 
@@ -156,8 +158,8 @@ class ForwardTable:
             series_vectors=np.ascontiguousarray(floating.series_sensitivity.T),
         )
 
-    def pad_table(self) -> ModelTable:
-        """Return it as the stages take it."""
+    def pad_table(self, states: int = 1) -> ModelTable:
+        """Return it as the stages take it; `states`: of a schedule, whose totals are free but for one."""
         return ModelTable(
             view_memory(self.nodes),
             len(self.nodes) - 1,
@@ -167,7 +169,7 @@ class ForwardTable:
             view_memory(self.search_fractions),
             view_memory(self.search_cells),
             SEARCH_POINTS,
-            _misfit_scale(_live_electrodes(self)),
+            _misfit_scale(_live_electrodes(self) - (states - 1)),
         )
 
 
@@ -205,12 +207,13 @@ def _chi_squared(freedom: int, probability: float) -> float:
     return freedom * (1 - variance + deviations * math.sqrt(variance)) ** 3
 
 
-def pair_limit(table: ForwardTable, false_alarm: float) -> float:
+def pair_limit(table: ForwardTable, false_alarm: float, states: int = 1) -> float:
     """Return the squared misfit of one contact that it exceeds with the probability `false_alarm`.
 
-    Infinite for a probability of 0, and for fewer than six currents: two contacts have six unknowns.
+    Infinite for a probability of 0, and for fewer than six currents: two contacts have six unknowns. Each of
+    several `states` of a schedule after the first has one more, its total.
     """
-    electrodes = _live_electrodes(table)
+    electrodes = _live_electrodes(table) - (states - 1)
     if electrodes < MIN_PAIR_ELECTRODES or not false_alarm > 0:
         return math.inf
     return _chi_squared(electrodes - 3, false_alarm)
@@ -277,19 +280,28 @@ def _tabulate_tolerances(
         """Return derivatives (n, y, x) at fixed fractions of the sides."""
         return np.asarray((other.fractions(s * other.a, t * other.b) - nominal) / step)
 
-    fields, vectors = [], []
-    for number, end in enumerate(network.ends):
+    states = network.states if isinstance(network, ScheduledNetwork) else (tuple(range(len(nominal))),)
+    ends, vectors = network.ends, np.zeros((len(network.ends), len(nominal)))
+    fields = np.zeros((len(states), len(ends), *s.shape))
+    for number, end in enumerate(ends):
         step = _TOLERANCE_STEP * (network.a, network.b)[end.axis]
-        by_end = slope(network.with_moved_end(number, step), step)  # of rank 1
-        left, singular, right = np.linalg.svd(by_end.reshape(len(by_end), -1), full_matrices=False)
-        vectors.append(left[:, 0] * singular[0])
-        fields.append(right[0].reshape(s.shape))
+        by_end = slope(network.with_moved_end(number, step), step)
+        for state, electrodes in enumerate(states):  # of rank 1: other states have other singularities
+            own = by_end[list(electrodes)].reshape(len(electrodes), -1)
+            left, singular, right = np.linalg.svd(own, full_matrices=False)
+            vectors[number, list(electrodes)] = left[:, 0] * singular[0]
+            fields[state, number] = right[0].reshape(s.shape)
     by_aspect = slope(network.stretched(math.exp(_TOLERANCE_STEP)), _TOLERANCE_STEP)
     by_waves = unevenness_slopes(network, s * network.a, t * network.b)
     columns = np.concatenate(
-        [fields, by_aspect, by_waves.reshape(-1, *s.shape), *_second_derivatives(network, s, t)]
+        [
+            fields.reshape(-1, *s.shape),
+            by_aspect,
+            by_waves.reshape(-1, *s.shape),
+            *_second_derivatives(network, s, t),
+        ]
     )
-    return hermite_table(np.moveaxis(columns, 0, -1)).astype(np.float32), np.array(vectors)
+    return hermite_table(np.moveaxis(columns, 0, -1)).astype(np.float32), vectors
 
 
 def _second_derivatives(

@@ -16,12 +16,16 @@ from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand.pads import log_aspect_std, metres_per_unit, pad_surface, relative_size_stds
 
 FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
 OVERHANG_STEP = 1 / 16
+_STATE_STD = 0.08
+"""Standard deviation of the logarithm of a contact's current in one state of a schedule, by its force."""
+_STATE_GRID = (np.arange(12) + 0.5) / 12
 _OVERHANGS, _DIRECTIONS, _SEGMENT_POINTS = 33, 8, 24
 
 
@@ -60,8 +64,29 @@ def stage_tolerances(
         view_memory(radius_m * overhangs(sheet.contact_elongation_std)),
         radius_m * OVERHANG_STEP,
         is_elongated,
+        max(1, len(pad.state_numbers)),
+        view_memory(_states_of_electrodes(pad)),
+        _STATE_STD if pad.switch_states else 0.0,
+        _state_ohm_std(network) / node.drive_v,
         not (end_vectors.any() or aspect_std or sheet.unevenness_std or has_series or is_elongated),
     )
+
+
+def _states_of_electrodes(pad: config.Pad) -> NDArray[np.intp]:
+    """Return the number of the state that each electrode (n,) is connected in; 0 where none is switched."""
+    states = np.zeros(len(pad.electrode_names), dtype=np.intp)
+    for number, electrodes in enumerate(pad.state_numbers):
+        states[list(electrodes)] = number
+    return states
+
+
+def _state_ohm_std(network: RectangleNetwork) -> float:
+    """Return the root mean square, over the pad, of what a contact's resistance to ground differs by between
+    the states of its schedule [ohm]; 0 without one."""
+    if not isinstance(network, ScheduledNetwork):
+        return 0.0
+    x, y = np.meshgrid(network.a * _STATE_GRID, network.b * _STATE_GRID)
+    return math.sqrt(network.state_resistance(x, y).var(axis=0).mean())
 
 
 @cache

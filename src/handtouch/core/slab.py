@@ -79,7 +79,7 @@ class Slab:
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
         self._single = bytearray(size)  # 1 where a sample is one PDO
-        self._partial_samples: dict[int, _PartialSample] = {}  # of pads with several PDOs
+        self._partial_samples: dict[int, _PartialSample | _ScheduledSample] = {}  # of pads with several PDOs
         self._fields = np.zeros((size, channels, receive.FIELD_WORDS), dtype=np.int64)
         self._counts_per_unit = np.zeros((size, channels))  # of REAL32 fields, 0 for integers
         self._is_real: NDArray[np.bool_] | None = None
@@ -98,8 +98,11 @@ class Slab:
         for slot in range(size):
             self.set_layout(slot, STANDARD_LAYOUT[:channels])
 
-    def set_layout(self, slot: int, layout: ChannelLayout) -> None:
+    def set_layout(self, slot: int, layout: ChannelLayout, scheduled: bool = False) -> None:
         """Set the channel fields of a slot, STANDARD_LAYOUT by default; its present sample is discarded.
+
+        scheduled: each of its PDOs is a state of a schedule, one in each cycle; a sample is the last of each,
+        if they are those of consecutive cycles.
 
         Channels beyond the slot's columns belong to a sample, but aren't unpacked.
         """
@@ -120,7 +123,8 @@ class Slab:
         self._single[slot] = pdos == {0}
         self._partial_samples.pop(slot, None)
         if not self._single[slot]:
-            self._partial_samples[slot] = _PartialSample(pdos)
+            kind = _ScheduledSample if scheduled else _PartialSample
+            self._partial_samples[slot] = kind(pdos)
         self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = bytes(_SAMPLE_BYTES)
         is_real = self._counts_per_unit > 0
         self._is_real = is_real if is_real.any() else None
@@ -182,9 +186,11 @@ class Slab:
 
     def begin_cycle(self, sync_ns: int) -> None:
         """Begin a cycle at a SYNC: samples that arrived since then are fresh, even if before this call."""
+        for slot, parts in self._partial_samples.items():
+            if parts.begin_cycle(sync_ns):
+                self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = parts.data
+                self._arrival_ns[slot] = parts.last_arrival_ns
         self.fresh_count = receive.begin_cycle(self.memory, sync_ns)
-        for parts in self._partial_samples.values():
-            parts.begin_cycle(sync_ns)
 
 
 class CountSlab(Slab):
@@ -259,10 +265,60 @@ class _PartialSample:
         self._missing |= self._required
         return not self._mixes_cycles
 
-    def begin_cycle(self, sync_ns: int) -> None:
-        """Drop PDOs from before the SYNC; PDOs arriving late in the next cycle look as if they were of it."""
+    @property
+    def last_arrival_ns(self) -> int:
+        """Arrival of the latest PDO, 0 before the first."""
+        return max(self._last_arrival_ns.values(), default=0)
+
+    def begin_cycle(self, sync_ns: int) -> bool:
+        """Drop PDOs from before the SYNC; return False: no sample becomes complete by that. PDOs
+        arriving late in the next cycle look as if they were of it.
+        """
         first, last = self._first_arrival_ns, self._last_arrival_ns
         self._mixes_cycles = any(first.get(pdo, sync_ns) >= sync_ns for pdo in self._required)
         self._last_arrival_ns = {pdo: at for pdo, at in last.items() if at >= sync_ns}
         self._first_arrival_ns = dict(self._last_arrival_ns)
         self._missing = set(self._required - self._last_arrival_ns.keys()) or set(self._required)
+        return False
+
+
+class _ScheduledSample:
+    """The last PDO of each state of a schedule, `required`; one arrives in each cycle.
+
+    The identifier of a PDO names its state. Without a SYNC or a PDO, or with one that arrives in another
+    cycle than its own, the last ones aren't of consecutive cycles: no sample is complete until they are.
+    """
+
+    def __init__(self, required: frozenset[int]) -> None:
+        self.data = bytearray(_SAMPLE_BYTES)
+        self._states = len(required)
+        self._cycle = 0
+        self._cycle_of: dict[int, int] = {}  # PDO -> cycle of its last arrival
+        self._arrival_ns: dict[int, int] = {}
+
+    def add_pdo(self, pdo: int, data: bytes | bytearray, arrival_ns: int) -> bool:
+        """Store a PDO; return True when those of all states are of consecutive cycles, the last this one."""
+        start = pdo * PDO_BYTES
+        self.data[start : start + len(data)] = data
+        self._arrival_ns[pdo], self._cycle_of[pdo] = arrival_ns, self._cycle
+        return self._is_complete
+
+    @property
+    def last_arrival_ns(self) -> int:
+        """Arrival of the latest PDO, 0 before the first."""
+        return max(self._arrival_ns.values(), default=0)
+
+    def begin_cycle(self, sync_ns: int) -> bool:
+        """Begin a cycle, to which a PDO that has arrived since the SYNC belongs; return True if that
+        completes a sample.
+        """
+        self._cycle += 1
+        arrived = [pdo for pdo, at_ns in self._arrival_ns.items() if at_ns >= sync_ns]
+        for pdo in arrived:
+            self._cycle_of[pdo] = self._cycle
+        return bool(arrived) and self._is_complete
+
+    @property
+    def _is_complete(self) -> bool:
+        cycles = sorted(self._cycle_of.values())
+        return cycles == list(range(self._cycle - self._states + 1, self._cycle + 1))

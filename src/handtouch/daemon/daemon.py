@@ -28,7 +28,7 @@ from handtouch.canbus.bus.loop_pause import LoopPause
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.master import Master
-from handtouch.canbus.nodes.spec import NodeSpec, node_specs
+from handtouch.canbus.nodes.spec import NodeSpec, node_specs, sync_overflows
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.compiled import Compilation
@@ -117,7 +117,7 @@ class HandtouchDaemon:
         self.percepts = PerceptPublisher(deployment, pipeline, publisher, session, inputs.commanded_joints_at)
         self._stack.callback(self.percepts.close)
         self.master = Master(self.ports, self._node_specs(), period_ns)
-        self.sync = Sync(list(self.ports.values()), period_ns)
+        self.sync = Sync(list(self.ports.values()), period_ns, sync_overflows(deployment))
         self.supervisor = self._build_supervisor(folder)
         self.reporter = StatusReporter(
             deployment,

@@ -26,6 +26,7 @@ from handtouch.core import pad_tables
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import ForwardTable
 from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.scheduled_network import ScheduledNetwork
 
 MAX_CACHE_BYTES = 256 << 20
 """Tables used least recently are removed beyond that; 130 distinct pads of four electrodes."""
@@ -116,6 +117,7 @@ def _table_key(network: RectangleNetwork) -> str:
         network.ends,
         network.sheet_ohm_per_square,
         network.series_ohm,
+        network.states if isinstance(network, ScheduledNetwork) else (),
         np.__version__,
         _code_hash(),
     )

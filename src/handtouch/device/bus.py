@@ -181,7 +181,7 @@ class DeviceBus:
                 for device in self._devices_with_id(identifier - cia301.NMT_ERROR_CONTROL):
                     device.handle_guard_request(now_ns)
             elif identifier == cia301.SYNC:
-                self._handle_sync(now_ns)
+                self._handle_sync(now_ns, frame.data[0] if frame.dlc else None)
             elif identifier == cia301.NMT:
                 self._handle_nmt(bytes(frame.data))
             elif identifier == cia301.LSS_REQUEST:
@@ -339,7 +339,7 @@ class DeviceBus:
         self.sample_count += 1
         self._next_sample_ns = now_ns + self._sample_period_ns
 
-    def _handle_sync(self, now_ns: int) -> None:
+    def _handle_sync(self, now_ns: int, counter: int | None) -> None:
         self.sync_count += 1
         self._take_sample(now_ns)
         if self._changed:
@@ -347,7 +347,7 @@ class DeviceBus:
         if self._standard_tpdos:
             self._send_standard_tpdos()
         for device, tpdo in self._sync_tpdos:
-            message = tpdo.make_sync_message(now_ns)
+            message = tpdo.make_sync_message(now_ns, counter)
             if message is not None:
                 device.transmit(message, is_data=True)
         if self._event_tpdos:

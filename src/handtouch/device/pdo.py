@@ -85,6 +85,7 @@ class DeviceTpdo:
         self.message.arbitration_id = cob_id & cia301.IDENTIFIER_MASK
         self._inhibit_ns = read(record, 3) * _INHIBIT_UNIT_NS
         self._event_ns = read(record, 5) * _EVENT_UNIT_NS
+        self._start_count = read(record, cia301.SYNC_START_SUB)
         self._load_events()
         self._load_mapping(self._read_entries(read(self._mapping, 0, count)))
         self.period_syncs = (
@@ -117,11 +118,19 @@ class DeviceTpdo:
         """True if it is sent by a change or the event timer."""
         return self._is_enabled and self._transmission_type in cia301.EVENT_DRIVEN_TYPES
 
-    def make_sync_message(self, now_ns: int) -> can.Message | None:
-        """Return the message to send at a SYNC: for type 0 after a change, for type n at each n-th."""
+    def make_sync_message(self, now_ns: int, counter: int | None = None) -> can.Message | None:
+        """Return the message to send at a SYNC: for type 0 after a change, for type n at each n-th.
+
+        counter: that of the SYNC, if it has one. With a SYNC start value and 0x1019 it decides which are the
+        n-th, so that a lost SYNC doesn't shift them; without a counter none is.
+        """
         if self._transmission_type == 0:
             has_changed = self._last_counts is None or self._exceeds_delta(self._sample())
             return self._make_message(now_ns) if has_changed else None
+        if self._start_count and self._objects.get_integer(cia301.SYNC_OVERFLOW, 0):
+            if counter is None or (counter - self._start_count) % self._transmission_type:
+                return None
+            return self._make_message(now_ns)
         self._sync_count += 1
         if self._sync_count < self._transmission_type:
             return None
@@ -145,7 +154,7 @@ class DeviceTpdo:
         elif index == self._communication and sub == 1:
             self._check_identifier(value)
         elif index == self._communication:
-            if self._is_strict and self._is_valid and sub in (2, 3, 5):
+            if self._is_strict and self._is_valid and sub in (2, 3, 5, cia301.SYNC_START_SUB):
                 raise SdoAbortedError(sdo.ABORT_APPLICATION_DEVICE_STATE)
             if sub == 2 and value not in cia301.SYNCHRONOUS_TYPES and value not in cia301.EVENT_DRIVEN_TYPES:
                 raise SdoAbortedError(sdo.ABORT_INVALID_VALUE)

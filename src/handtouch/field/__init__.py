@@ -18,6 +18,7 @@ from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
 from handtouch.field.resolve import ContactShape, ResolvedContacts, ShapeEstimate, resolve_contacts
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
+from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import (
     AnisotropicSurface,
     ConeSurface,
@@ -57,6 +58,7 @@ __all__ = [
     "RevolutionSurface",
     "Sandwich",
     "SandwichEstimate",
+    "ScheduledNetwork",
     "ShapeEstimate",
     "SphereSurface",
     "Surface",

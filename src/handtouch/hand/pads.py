@@ -18,6 +18,7 @@ from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.outline_surface import OutlineSurface
 from handtouch.field.perimeter_network import PerimeterNetwork
 from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
@@ -56,7 +57,8 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
 
 
 def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
-    """Return the pad's electrodes on its rectangle, whether on its sides or on arcs of its outline."""
+    """Return the pad's electrodes on its rectangle, whether on its sides or on arcs of its outline, and with
+    their schedule if they are switched."""
     if not pad.arcs_mm:
         return electrode_network(pad, sheet)
     surface = pad_surface(pad)
@@ -64,7 +66,8 @@ def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
         raise ValueError("electrode_arcs_mm: only pads with an outline have arcs")
     ends_m = _M_PER_MM * (np.array(pad.arcs_mm) + np.array(pad.gaps_mm) * (1.0, -1.0))
     spans = surface.perimeter_positions(ends_m)
-    return PerimeterNetwork(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
+    network = PerimeterNetwork(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
+    return ScheduledNetwork(network, pad.state_numbers) if pad.switch_states else network
 
 
 def electrode_network(

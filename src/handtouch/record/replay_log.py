@@ -17,7 +17,7 @@ from handtouch.canbus import cia301
 from handtouch.canbus.bus.router import BusCounters, Router
 from handtouch.canbus.objects.mapping import mapping_from_eds
 from handtouch.config import Deployment
-from handtouch.config.channels import order_channels, resolve_channels
+from handtouch.config.channels import channel_states, order_channels, resolve_channels
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.record.replay_sink import ContactCallback, ReplayPublisher, ReplaySink
@@ -68,8 +68,8 @@ class _LogReplayer:
         for slot, pad in enumerate(pads):
             kind = deployment.nodes[pad.node]
             channels = order_channels(resolve_channels(kind.channels, kind.eds), pad)
-            mapping = mapping_from_eds(kind.eds, pad.node_id, channels)
-            self.pipeline.slab.set_layout(slot, mapping.layout)
+            mapping = mapping_from_eds(kind.eds, pad.node_id, channels, channel_states(pad))
+            self.pipeline.slab.set_layout(slot, mapping.layout, bool(mapping.states))
             for number, tpdo in enumerate(mapping.tpdos):
                 self.routers[pad.bus].route(tpdo.cob_id, slot, number, tpdo.size_bytes)
             self._known_ids |= {base + pad.node_id for base in _NODE_COB_BASES}

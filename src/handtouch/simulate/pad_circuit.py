@@ -86,6 +86,8 @@ class PadCircuit:
     series_ohm: FloatArray
     drive_v: float
     limit_a: FloatArray
+    states: tuple[tuple[int, ...], ...] = ()
+    """Electrodes that are connected in each state of a schedule; empty: all of them, always."""
     _solved_by_faults: dict[tuple[Fault, ...], tuple[SheetCircuit, SheetMapBank]] = field(
         default_factory=dict
     )
@@ -93,7 +95,15 @@ class PadCircuit:
 
     @cached_property
     def healthy(self) -> SheetCircuit:
-        """Circuit without faults."""
+        """Circuit without faults; of a schedule, its currents in the mean of the states."""
+        if self.states:
+            circuits = [one.healthy for one in self._state_circuits]
+            return SheetCircuit(
+                np.mean([one.share_to_channel for one in circuits], axis=0),
+                np.mean([one.impedance_ohm for one in circuits], axis=0),
+                np.mean([one.idle_a for one in circuits], axis=0),
+                np.mean([one.idle_v for one in circuits], axis=0),
+            )
         return SheetCircuit.from_wiring(self.maps.conductance, self.sheet.ohm_per_square, self._new_wiring())
 
     def currents(
@@ -107,7 +117,14 @@ class PadCircuit:
         """Return the currents (n, m) [A] that the wires of the electrodes carry to the amplifiers.
 
         force_ratio: (n,), apparent over true force. supply_ratio: (n,) or (), actual over nominal voltage.
+        With a schedule the current of each electrode is that of the state in which it is connected.
         """
+        if self.states:
+            by_state = [
+                one.currents(times_s, touches, faults, force_ratio, supply_ratio)
+                for one in self._state_circuits
+            ]
+            return np.asarray(sum(by_state))  # of each electrode all but one are 0
         changes = [fault for fault in faults if _changes_circuit(fault)]
         currents = np.zeros((len(times_s), len(self.series_ohm)))
         active = np.array([fault.is_active(times_s) for fault in changes]).reshape(len(changes), len(times_s))
@@ -118,6 +135,20 @@ class PadCircuit:
                 present, times_s[rows], touches, faults, force_ratio[rows]
             )
         return np.asarray(currents * np.reshape(supply_ratio, (-1, 1)))
+
+    @cached_property
+    def _state_circuits(self) -> list[PadCircuit]:
+        """Circuits of the states of a schedule, each solved by itself."""
+        number = np.arange(len(self.series_ohm))
+        return [
+            dataclasses.replace(
+                self,
+                series_ohm=np.where(np.isin(number, state), self.series_ohm, np.inf),
+                states=(),
+                _solved_by_faults={},
+            )
+            for state in self.states
+        ]
 
     def _currents_with_faults(
         self,

@@ -76,7 +76,9 @@ class VirtualHand:
             [row.pad.electrode_names for row in self.virtual_pads],
         )
         self._special_rows = [
-            number for number, row in enumerate(self.virtual_pads) if row.faults or row.replacement_gains
+            number
+            for number, row in enumerate(self.virtual_pads)
+            if row.faults or row.replacement_gains or row.circuit.states
         ]
         self._touch_pads = [
             [

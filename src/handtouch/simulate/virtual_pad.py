@@ -81,7 +81,7 @@ class VirtualPad:
         limits = np.array([channel.limits for channel in channels])
         scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names])
         full = np.array([node.full_scale_counts or high for high in limits[:, 1]])
-        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * np.array(hidden.gain_ratio)
+        per_ampere = full / (node.full_scale_ma * 1e-3 * scale) * _gain_ratios(pad, hidden)
         shape = world.surface(hand, pad)
         gaps = true_arcs(pad, hidden) if pad.arcs_mm else true_gaps(shape, hidden)
         _check_faults(pad, faults, stimulus)
@@ -95,6 +95,7 @@ class VirtualPad:
             np.array(hidden.series_ohm),
             node.drive_v,
             limits[:, 1] / per_ampere,
+            pad.state_numbers,
         )
         touches = stimulus.pad_stimulus(pad.link, lambda number: world.contact(sheet, number).patch)
         repeat_s = stimulus.duration_s if stimulus.repeat else np.inf
@@ -245,6 +246,14 @@ class VirtualPad:
     @cached_property
     def _other_faults(self) -> list[Fault]:
         return [fault for fault in self.faults if fault not in self._stuck_faults]
+
+
+def _gain_ratios(pad: config.Pad, hidden: HiddenPad) -> FloatArray:
+    """Return the true over the stated gain of each electrode's channel; switched ones share channels."""
+    ratios = np.array(hidden.gain_ratio)
+    for first, *others in zip(*pad.state_numbers, strict=True):
+        ratios[others] = ratios[first]
+    return ratios
 
 
 def true_gaps(shape: SimulatedSurface, hidden: HiddenPad) -> ElectrodeGaps:

@@ -21,7 +21,11 @@ _BLOCK_DURATION_NS = 250_000_000
 
 
 class DeploymentDiagnostics:
-    """Diagnostics of all pads, numbered in the order of the deployment."""
+    """Diagnostics of all pads, numbered in the order of the deployment.
+
+    Pads with a schedule of switched electrodes have none: each of their readings is repeated until its state
+    is next.
+    """
 
     def __init__(self, deployment: Deployment) -> None:
         self._hands: list[tuple[slice, diagnose.HandDiagnostics]] = []
@@ -36,6 +40,7 @@ class DeploymentDiagnostics:
             self._stated_gain_covariance[first] = model.gain_covariance.copy()
             self._hands.append((rows, diagnose.HandDiagnostics(model)))
             first = rows.stop
+        self._switched = np.array([bool(entry.pad.switch_states) for entry in deployment.pads])
         self._pending: list[SampleBlock] = []
         self._diagnoses: list[tuple[int, Diagnosis]] = []
 
@@ -49,6 +54,7 @@ class DeploymentDiagnostics:
             np.concatenate([getattr(one, name) for one in blocks])
             for name in ("sample_ns", "counts", "fresh")
         )
+        fresh = fresh & ~self._switched
         self._diagnoses = []
         for rows, hand in self._hands:
             if fresh[:, rows].any():

@@ -61,6 +61,9 @@ _MAX_ZERO_CHANGE_SIGMA = 3.0
 """Greatest change of a channel's zero since it was stored; a greater one is a load."""
 
 
+_SWITCHED = "electrodes share channels by switch_states: gains aren't learned, the pad isn't diagnosed"
+
+
 class Diagnostics(Protocol):
     """Source of diagnoses, as `DeploymentDiagnostics`."""
 
@@ -85,6 +88,8 @@ class _PadEntry:
     calibrator: AutoCalibrator
     contact_detector: StationaryContactDetector
     channels: int
+    is_switched: bool = False
+    """its electrodes share channels by a schedule: their gains aren't independent, and aren't learned"""
     version_number: int = 0
     """number of the newest stored version of the node, 0 for none"""
     rejection_reason: str = ""
@@ -114,7 +119,10 @@ class SupervisorWorker:
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
             design, sheet = (
-                (pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
+                (
+                    *(pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
+                    pad.state_numbers,
+                ),
                 deployment.sheets[pad.sheet],
             )
             if design not in models:
@@ -125,6 +133,7 @@ class SupervisorWorker:
             channels = len(pad.electrode_names)
             detector = StationaryContactDetector(noise[number, :channels])
             self._pads.append(_PadEntry(mounting_point, AutoCalibrator(*models[design]), detector, channels))
+            self._pads[-1].is_switched = bool(pad.switch_states)
         self._ampere_per_count = start.ampere_per_count
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])
@@ -272,7 +281,9 @@ class SupervisorWorker:
     ) -> None:
         """Calibrate the node of a pad by the contacts in a block."""
         row = self._pads[pad]
-        if not row.calibrator.can_learn or pad in self._diagnoses:  # nothing is learnt from a faulty pad
+        if row.is_switched or not row.calibrator.can_learn:
+            return
+        if pad in self._diagnoses:  # nothing is learnt from a faulty pad
             return
         fresh = block.fresh[:, pad]
         counts = block.counts[:, pad] - block.offset_counts[pad]
@@ -391,6 +402,8 @@ class SupervisorWorker:
         """Report the assessment of a pad, if it changed."""
         row = self._pads[pad]
         progress = row.calibrator.progress
+        if row.is_switched:
+            progress = _SWITCHED
         if row.rejection_reason:
             progress = f"{row.rejection_reason}; {progress}"
         diagnoses = (*row.calibrator.diagnoses, *self._store_diagnoses(row), *self._diagnoses.get(pad, ()))

@@ -11,7 +11,7 @@ Public names: `Sync`, `SyncJitter`, `percentiles_us`.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,13 +89,18 @@ class Sync:
 
     SYNC is produced on buses with sync = "producer" unless their role is "listener"; without such a bus the
     first bus's SYNC is followed. Times in ns of the host's monotonic clock. `overruns` counts the periods
-    without a SYNC or a cycle because the loop was late.
+    without a SYNC or a cycle because the loop was late. `counter_overflow`: by bus, the last value of the
+    counter in its SYNC; the loop sends it there, as the kernel sends the same frame each time. Other buses
+    have no counter.
     """
 
-    def __init__(self, ports: Sequence[Port], period_ns: int) -> None:
+    def __init__(
+        self, ports: Sequence[Port], period_ns: int, counter_overflow: Mapping[str, int] | None = None
+    ) -> None:
         self.period_ns = period_ns
         self.overruns = 0
-        self._buses = {port.name: _SyncBus(port) for port in ports}
+        overflow = counter_overflow or {}
+        self._buses = {port.name: _SyncBus(port, overflow.get(port.name, 0)) for port in ports}
         self._produced_buses = [bus for bus in self._buses.values() if bus.is_producer]
         self._reference_bus: _SyncBus | None = None  # its SYNC begins the cycle; None: the loop's timer does
         self._due_ns = self._cycle_sync_ns = 0
@@ -224,8 +229,9 @@ class Sync:
 class _SyncBus:
     """SYNC of one bus; `kernel_sender` is None where the loop or another producer sends."""
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, port: Port, counter_overflow: int = 0) -> None:
         self.port = port
+        self._counter, self._counter_overflow = 0, counter_overflow
         self.is_producer = port.bus.sync == "producer" and port.bus.role != "listener"
         self.kernel_sender: CyclicSender | None = None
         self.jitter = SyncJitter()
@@ -239,7 +245,7 @@ class _SyncBus:
         port = self.port
         port.last_sync_ns = now_ns
         self.jitter.add_sync(now_ns, period_ns)
-        if now_ns >= self.kernel_retry_ns:
+        if now_ns >= self.kernel_retry_ns and not self._counter_overflow:
             self.kernel_retry_ns = now_ns + _KERNEL_RETRY_NS
             if port.bus_state.error_state not in (ErrorState.DOWN, ErrorState.BUS_OFF):
                 self.kernel_sender = port.send_cyclically(cia301.SYNC, b"", period_ns * 1e-9)
@@ -247,7 +253,11 @@ class _SyncBus:
                     self.jitter.skip_interval()
                     self.start_window(now_ns, self._sent_syncs)
                     return
-        if port.send(cia301.SYNC, b""):
+        data = b""
+        if self._counter_overflow:
+            self._counter = self._counter % self._counter_overflow + 1
+            data = bytes((self._counter,))
+        if port.send(cia301.SYNC, data):
             self._sent_syncs += 1
 
     def set_period(self, period_ns: int, now_ns: int) -> bool:

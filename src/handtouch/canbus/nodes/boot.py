@@ -168,8 +168,11 @@ def check_settings(
             _check_value(sdo, index, sub, entry, f"mapping of TPDO{number}", form="0x{:08X}")
         _check_cob_id(sdo, tpdo)
         index = cia301.TPDO_COMMUNICATION + number - 1
-        allowed = cia301.EVENT_DRIVEN_TYPES if event_driven else (cia301.SYNCHRONOUS,)
+        allowed = cia301.EVENT_DRIVEN_TYPES if event_driven else (_synchronous_type(mapping),)
         _check_value(sdo, index, 2, allowed[-1], f"transmission type of TPDO{number}", allowed)
+    for tpdo, state in zip(mapping.tpdos, mapping.states, strict=False):
+        index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"SYNC start value of TPDO{tpdo.number}"
+        _check_value(sdo, index, cia301.SYNC_START_SUB, state + 1, name)
     if heartbeat_ms is not None:
         _check_value(sdo, cia301.HEARTBEAT_TIME, 0, heartbeat_ms, "heartbeat time")
 
@@ -212,23 +215,27 @@ def configure_node(
     settings: NodeSettings,
     enter_preoperational: Callable[[], None],
     booted: bool = False,
+    sync_overflow: int = 0,
 ) -> NodeConfigured:
     """Write what differs, and read it back: PDOs enabled and synchronous, heartbeat time.
 
     A node that can't follow SYNC sends at the same rate by its event timer if all its channels are in one
     PDO. A node without heartbeat gets the heartbeat time as its guard time. The heartbeat time is always
     written to a node that has just `booted`: another node with the same id may have responded instead, and
-    only its heartbeats reveal it. `enter_preoperational` is called only if a PDO must be changed, which many
+    only its heartbeats reveal it. `sync_overflow`: last value of the counter in SYNC, 0 without one.
+    `enter_preoperational` is called only if a PDO must be changed, which many
     nodes refuse in state operational.
     """
-    if any(not tpdo.enabled or tpdo.transmission_type != cia301.SYNCHRONOUS for tpdo in mapping.tpdos):
+    synchronous = _synchronous_type(mapping)
+    if any(not tpdo.enabled or tpdo.transmission_type != synchronous for tpdo in mapping.tpdos):
         enter_preoperational()
+    _set_up_schedule(sdo, mapping, sync_overflow, enter_preoperational)
     refusal, event_timed = "", False
     single = len(mapping.tpdos) == 1  # several event-driven PDOs would not form one sample
     for tpdo in mapping.tpdos:
-        if tpdo.transmission_type != cia301.SYNCHRONOUS:
+        if tpdo.transmission_type != synchronous:
             try:
-                _set_transmission_type(sdo, tpdo, cia301.SYNCHRONOUS)
+                _set_transmission_type(sdo, tpdo, synchronous)
             except BootStepError as error:
                 if error.timed_out or not single or tpdo.transmission_type not in cia301.EVENT_DRIVEN_TYPES:
                     raise
@@ -309,6 +316,38 @@ def _set_transmission_type(sdo: NodeSdoClient, tpdo: NodeTpdo, kind: int) -> Non
             raise
         with _tpdo_disabled(sdo, tpdo):
             sdo.write_verified(index, 2, kind, 1, name)
+
+
+def _synchronous_type(mapping: PdoMapping) -> int:
+    """Return the transmission type of TPDOs sent with SYNC: with each, or once in a schedule."""
+    return len(mapping.states) or cia301.SYNCHRONOUS
+
+
+def _set_up_schedule(
+    sdo: NodeSdoClient, mapping: PdoMapping, sync_overflow: int, enter_preoperational: Callable[[], None]
+) -> None:
+    """Have the node expect the counter in SYNC, and send the TPDO of each state at its counts alone.
+
+    Raises BootStepError for a node with a schedule that doesn't have the objects; others may lack the first.
+    """
+    if not sync_overflow:
+        return
+    name = "SYNC counter overflow"
+    overflow = sdo.read_optional(cia301.SYNC_OVERFLOW, 0, name)
+    if overflow is None and mapping.states:
+        raise BootStepError(
+            "has no 0x1019, SYNC counter overflow, so that it can't follow switch_states; use a node that "
+            "counts SYNCs, or leave switch_states out of the deployment"
+        )
+    if overflow is not None and overflow != sync_overflow:
+        enter_preoperational()
+        sdo.write_verified(cia301.SYNC_OVERFLOW, 0, sync_overflow, 1, name)
+    for tpdo, state in zip(mapping.tpdos, mapping.states, strict=False):
+        index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"SYNC start value of TPDO{tpdo.number}"
+        if sdo.read(index, cia301.SYNC_START_SUB, name) != state + 1:
+            enter_preoperational()
+            with _tpdo_disabled(sdo, tpdo):  # CiA 301: not while the PDO is valid
+                sdo.write_verified(index, cia301.SYNC_START_SUB, state + 1, 1, name)
 
 
 def _set_event_timer(sdo: NodeSdoClient, tpdo: NodeTpdo, period_ms: int) -> None:

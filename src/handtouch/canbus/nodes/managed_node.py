@@ -113,7 +113,7 @@ def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns:
     sdo = SdoTransport(spec.node_id, port.send, received_until_ns=lambda: port.received_until_ns)
     node = ManagedNode(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), sdo)
     if timing.role is BusRole.LISTENER:  # it can't be read from the node
-        node.mapping = mapping_from_eds(spec.eds, spec.node_id, spec.channels)
+        node.mapping = mapping_from_eds(spec.eds, spec.node_id, spec.channels, spec.channel_states)
     return node
 
 
@@ -164,7 +164,9 @@ def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle:
 
     if step is NodeAction.READ_MAPPING:
         before_remapping = enter_preoperational if spec.allow_pdo_remapping else None
-        return read_mapping(sdo, spec.node_id, node.tpdo_numbers, spec.channels, before_remapping)
+        return read_mapping(
+            sdo, spec.node_id, node.tpdo_numbers, spec.channels, before_remapping, spec.channel_states
+        )
     if step is NodeAction.ENTER_STANDBY:
         try:
             boot.set_excitation(sdo, spec.excitation, False)
@@ -182,7 +184,7 @@ def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle:
     if step is NodeAction.SET_TRANSMISSION:
         boot.set_transmission(sdo, node.mapping.tpdos[0], idle)
         return boot.TransmissionSet(idle)
-    return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted)
+    return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted, spec.sync_overflow)
 
 
 def send_nmt(node: ManagedNode, action: NodeAction) -> None:

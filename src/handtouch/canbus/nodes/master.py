@@ -503,7 +503,7 @@ class Master:
         for tpdo in node.mapping.tpdos if node.mapping else ():
             router.route(tpdo.cob_id, NO_SLOT)
         if node.mapping is None or node.mapping.layout != mapping.layout:
-            node.port.slab.set_layout(slot, mapping.layout)
+            node.port.slab.set_layout(slot, mapping.layout, bool(mapping.states))
         for number, tpdo in enumerate(mapping.tpdos):
             router.route(tpdo.cob_id, slot, number, tpdo.size_bytes)
         node.mapping = mapping

@@ -1,11 +1,12 @@
 """Nodes of a deployment as the master gets them, and their status and events as it reports them.
 
-Public names: `NodeSpec`, `node_specs`, `check_nodes`, `NodeStatus`; `MasterEvent`, a union of `NodeEvent`,
-`ErrorChanged` and `SerialChanged`.
+Public names: `NodeSpec`, `node_specs`, `sync_overflows`, `check_nodes`, `NodeStatus`; `MasterEvent`, a union
+of `NodeEvent`, `ErrorChanged` and `SerialChanged`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -16,12 +17,15 @@ from handtouch.config import (
     ConfigError,
     Deployment,
     Node,
+    Pad,
     Problem,
 )
 from handtouch.config.channels import (
     STANDARD_CHANNELS,
     Channels,
     WritableObject,
+    channel_states,
+    order_by_electrode,
     order_channels,
     parse_writable_object,
     resolve_channels,
@@ -38,6 +42,8 @@ class NodeSpec:
     `allow_pdo_remapping` : they may be mapped to a TPDO over SDO
     `allow_nmt_reset` : one NMT reset communication may be sent when it refuses to run
     `event_timer_ms` : period of a node that can't follow SYNC
+    `channel_states` : of a pad with a schedule, the state in which each channel is measured
+    `sync_overflow` : last value of the counter in SYNC, 0 where SYNC has none
     `serials_of_other_pads` : serial numbers configured for other pads
     """
 
@@ -59,11 +65,23 @@ class NodeSpec:
     heartbeat_ms: int = 100
     heartbeat_timeout_ms: int = 350
     event_timer_ms: int = 5
+    channel_states: tuple[int, ...] = ()
+    sync_overflow: int = 0
+
+
+def sync_overflows(deployment: Deployment) -> dict[str, int]:
+    """Return the last value of the counter in SYNC, a multiple of the states of every schedule, by the names
+    of the buses that have pads with one."""
+    overflows: dict[str, int] = {}
+    for _, pad in deployment.pads:
+        if pad.switch_states:
+            overflows[pad.bus] = math.lcm(overflows.get(pad.bus, 1), len(pad.switch_states))
+    return overflows
 
 
 def node_specs(deployment: Deployment) -> list[NodeSpec]:
     """Return the nodes of a deployment in the order of its pads. Raises EdsError."""
-    pads = deployment.pads
+    pads, overflows = deployment.pads, sync_overflows(deployment)
     specs = []
     for slot, (hand, pad) in enumerate(pads):
         kind = deployment.nodes[pad.node]
@@ -86,6 +104,8 @@ def node_specs(deployment: Deployment) -> list[NodeSpec]:
                 heartbeat_ms=kind.heartbeat_ms,
                 heartbeat_timeout_ms=kind.heartbeat_timeout_ms,
                 event_timer_ms=max(1, round(deployment.daemon.sync_period_ms)),
+                channel_states=channel_states(pad),
+                sync_overflow=overflows.get(pad.bus, 0),
             )
         )
     return specs
@@ -107,8 +127,12 @@ def _find_problems(deployment: Deployment) -> Iterator[Problem]:
             channels = resolve_channels(kind.channels, kind.eds)
             for hand in deployment.hands:
                 for pad in hand.pads:
+                    if pad.node == name and pad.switch_states:
+                        yield from _find_wide_states(f"{hand.name}/{pad.link}", pad, channels)
                     if pad.node == name and pad.bus in listener_buses:
-                        mapping_from_eds(kind.eds, pad.node_id, channels)
+                        states = channel_states(pad)
+                        ordered = order_by_electrode(channels, pad) if states else channels
+                        mapping_from_eds(kind.eds, pad.node_id, ordered, states)
         except EdsError as error:
             yield Problem(f"{prefix}channels", "", str(error))
         else:
@@ -123,6 +147,17 @@ def _find_problems(deployment: Deployment) -> Iterator[Problem]:
                 yield from _find_unwritable(f"{prefix}delta_objects", text, kind.idle.delta_counts)
             if kind.idle.enable_object:
                 yield from _find_unwritable(f"{prefix}enable_object", kind.idle.enable_object)
+
+
+def _find_wide_states(name: str, pad: Pad, channels: Channels) -> Iterator[Problem]:
+    """Yield a problem unless the channels of each state fit into a PDO."""
+    if len(channels) != len(pad.electrode_names) or sorted(pad.electrodes) != sorted(pad.electrode_names):
+        return
+    bits = [channel.bits for channel in order_by_electrode(channels, pad)]
+    widest = max(sum(bits[number] for number in state) for state in pad.state_numbers)
+    if widest > 64:
+        text = f"a state has channels of {widest} bits, but a TPDO carries 64; use narrower channels"
+        yield Problem(f'[[hand.pad]] "{name}": switch_states', "", text)
 
 
 def _find_unwritable(key: str, text: str, value: int = 1) -> Iterator[Problem]:

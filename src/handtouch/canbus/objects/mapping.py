@@ -54,14 +54,22 @@ class NodeTpdo:
 
 @dataclass(frozen=True, slots=True)
 class PdoMapping:
-    """TPDOs that carry the channels, and the layout of the channels in them."""
+    """TPDOs that carry the channels, and the layout of the channels in them.
+
+    `states` : of a pad with a schedule, the state that each TPDO carries
+    """
 
     tpdos: tuple[NodeTpdo, ...]
     layout: ChannelLayout
+    states: tuple[int, ...] = ()
 
 
-def find_channels(tpdos: Sequence[NodeTpdo], channels: Channels) -> PdoMapping | None:
+def find_channels(
+    tpdos: Sequence[NodeTpdo], channels: Channels, states: Sequence[int] = ()
+) -> PdoMapping | None:
     """Return the mapping of the channels, to a single TPDO if one has all; None if a channel isn't mapped.
+
+    states: of a schedule, that of each channel; None unless each state has a TPDO of its own.
 
     Raises BootStepError for a channel that is mapped with another width than that of its type.
     """
@@ -78,11 +86,21 @@ def find_channels(tpdos: Sequence[NodeTpdo], channels: Channels) -> PdoMapping |
         for row, channel in zip(rows, channels, strict=True)
         if row is not None
     ]
-    return PdoMapping(tuple(tpdos[row] for row in used), tuple(fields))
+    found = tuple(tpdos[row] for row in used)
+    if not states:
+        return PdoMapping(found, tuple(fields))
+    carried = {(field.pdo, state) for field, state in zip(fields, states, strict=True)}
+    if not len(carried) == len(used) == len(set(states)):
+        return None
+    return PdoMapping(found, tuple(fields), tuple(state for _, state in sorted(carried)))
 
 
-def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) -> PdoMapping:
+def mapping_from_eds(
+    path: Path | str | None, node_id: int, channels: Channels, states: Sequence[int] = ()
+) -> PdoMapping:
     """Return the default mapping by a node's EDS; without an EDS that of CiA 401, in TPDO2.
+
+    states: see `find_channels`.
 
     Raises EdsError if no TPDO of the EDS carries the channels.
     """
@@ -107,15 +125,15 @@ def mapping_from_eds(path: Path | str | None, node_id: int, channels: Channels) 
         if cob_ids[t.number]
     ]
     try:
-        mapping = find_channels(defaults, channels)
+        mapping = find_channels(defaults, channels, states)
         for tpdo in mapping.tpdos if mapping else ():
             _check_identifier(tpdo.number, cob_ids[tpdo.number], tpdo.cob_id)
     except BootStepError as error:
         raise eds.EdsError(f"{path}: {error}") from error
     if mapping is None:
         raise eds.EdsError(
-            f"{path}: no TPDO carries {_channel_names(channels)}; {_describe_tpdos(defaults)}; "
-            "correct channels"
+            f"{path}: no TPDO carries {_channel_names(channels)}{_by_states(states)}; "
+            f"{_describe_tpdos(defaults)}; correct channels"
         )
     return mapping
 
@@ -138,8 +156,11 @@ def read_mapping(
     numbers: Sequence[int],
     channels: Channels,
     enter_preoperational: Callable[[], None] | None = None,
+    states: Sequence[int] = (),
 ) -> PdoMapping:
     """Read the TPDOs with these numbers, in this order, until all channels are found.
+
+    states: see `find_channels`.
 
     If a channel isn't mapped and `enter_preoperational` is given, the channels are mapped to TPDOs that carry
     nothing else. Raises BootStepError, with the mappings read, where neither is possible.
@@ -150,16 +171,17 @@ def read_mapping(
         if entries is None:
             continue
         candidates.append(NodeTpdo(number, 0, False, 0, entries))
-        mapping = find_channels(candidates, channels)
+        mapping = find_channels(candidates, channels, states)
         if mapping is not None:
             tpdos = tuple(_read_communication(sdo, tpdo) for tpdo in mapping.tpdos)
-            return PdoMapping(tpdos, mapping.layout)
+            return replace(mapping, tpdos=tpdos)
     if enter_preoperational is None:
         raise BootStepError(
-            f"no TPDO carries {_channel_names(channels)}; {_describe_tpdos(candidates)}; "
+            f"no TPDO carries {_channel_names(channels)}{_by_states(states)}; "
+            f"{_describe_tpdos(candidates)}; "
             "map them in the node and store the mapping, or correct channels in the deployment"
         )
-    return _remap(sdo, node_id, candidates, channels, enter_preoperational)
+    return _remap(sdo, node_id, candidates, channels, enter_preoperational, states)
 
 
 def _channel_offsets(tpdo: NodeTpdo, channels: Channels) -> list[tuple[Channel, int]]:
@@ -217,11 +239,16 @@ def _remap(
     candidates: Sequence[NodeTpdo],
     channels: Channels,
     enter_preoperational: Callable[[], None],
+    states: Sequence[int],
 ) -> PdoMapping:
-    """Map the channels, in order, to as few TPDOs as can hold them."""
+    """Map the channels, in order, to as few TPDOs as can hold them; those of a schedule by state."""
     objects = {channel.mapping_entry >> 8 for channel in channels}
     free = [tpdo for tpdo in candidates if all(entry >> 8 in objects for entry in tpdo.entries)]
-    groups = _group_by_pdo(channels)
+    groups = [
+        group
+        for state in sorted({*states}) or [-1]
+        for group in _group_by_pdo([c for k, c in enumerate(channels) if state < 0 or states[k] == state])
+    ]
     if len(free) < len(groups):
         raise BootStepError(
             f"no TPDO carries {_channel_names(channels)}, and {len(groups)} that carry nothing else are "
@@ -232,10 +259,11 @@ def _remap(
         _map_channels(sdo, node_id, tpdo.number, tuple(channel.mapping_entry for channel in group))
         for tpdo, group in zip(free, groups, strict=False)
     ]
-    mapping = find_channels(mapped, channels)
+    mapping = find_channels(mapped, channels, states)
     if mapping is None:
         raise BootStepError(
-            f"mapped, but no TPDO carries {_channel_names(channels)}; {_describe_tpdos(mapped)}"
+            f"mapped, but no TPDO carries {_channel_names(channels)}{_by_states(states)}; "
+            f"{_describe_tpdos(mapped)}"
         )
     return mapping
 
@@ -259,13 +287,17 @@ def _map_channels(sdo: NodeSdoClient, node_id: int, number: int, entries: tuple[
     return replace(tpdo, transmission_type=transmission)
 
 
-def _group_by_pdo(channels: Channels) -> list[list[Channel]]:
+def _group_by_pdo(channels: Sequence[Channel]) -> list[list[Channel]]:
     groups: list[list[Channel]] = [[]]
     for channel in channels:
         if sum(c.bits for c in groups[-1]) + channel.bits > _PDO_BITS:
             groups.append([])
         groups[-1].append(channel)
     return groups
+
+
+def _by_states(states: Sequence[int]) -> str:
+    return f", {len({*states})} states of switch_states in a TPDO each" if states else ""
 
 
 def _channel_names(channels: Channels) -> str:

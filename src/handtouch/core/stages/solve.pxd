@@ -21,13 +21,15 @@ cdef class ContactSolver:
     cdef force.ForceResult result
     cdef Py_ssize_t electrodes
     cdef double[::1] by_x, by_y, by_total
+    cdef double moved_x, moved_y
     cdef double[::1] currents, weight, gain_covariance, offset_std, values
     cdef unsigned char[::1] force_requested
     @cython.locals(k=Py_ssize_t)
     cpdef solve_contacts(self, Py_ssize_t[::1] pads)
 
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit,
-               table=locate.ModelTable, values='double[::1]')
+               table=locate.ModelTable, values='double[::1]', parts=tolerances.PadTolerances, last_x=double,
+               last_y=double, lag=double)
 cdef void solve_contact(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(k=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit, table=locate.ModelTable,
                at=tables.Placement, parts='double[::1]')
@@ -46,6 +48,8 @@ cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) no
 cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(row=Py_ssize_t, fit=locate.Fit, at=tables.Placement, values='double[::1]')
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(fit=locate.Fit, moved_x=double, moved_y=double)
+cdef void _add_motion(ContactSolver solver, double factor) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances)
 cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances, at=tables.Placement)

@@ -60,6 +60,7 @@ that explains the residual."""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
 _TWO_PI, _INFINITY = 2.0 * math.pi, math.inf
+_PART_MOTION = 2.0  # of one of two contacts that moves, in motions of the single contact that explains both
 _PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 
 
@@ -105,6 +106,7 @@ class ContactSolver:
         self.laws, self.surfaces = laws, surfaces
         self.stack, self.fit, self.placement = stack, fit, placement
         self.result = force.ForceResult()
+        self.moved_x = self.moved_y = 0.0  # in the course of a schedule
         self.electrodes = electrodes
         self.by_x, self.by_y, self.by_total = (
             work[:electrodes], work[electrodes : 2 * electrodes], work[2 * electrodes : 3 * electrodes],
@@ -122,9 +124,10 @@ class ContactSolver:
 
 def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
-    fit, table, values = solver.fit, solver.models[pad], solver.values
+    fit, table, values, parts = solver.fit, solver.models[pad], solver.values, solver.pad_tolerances[pad]
     n, row, first = table.electrodes, pad * _COUNT, pad * solver.electrodes
     fit.whitening.electrodes = n
+    last_x, last_y = values[row + _X], values[row + _X + 1]
     offset2 = solver.offset_std[pad] * solver.offset_std[pad] / n
     for i in range(n):
         weight = solver.weight[first + i]
@@ -134,7 +137,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     locate.locate(
         table,
         fit,
-        solver.pad_tolerances[pad],
+        parts,
         solver.known,
         pad,
         solver.gain_covariance,
@@ -156,6 +159,10 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
             _span_two_patches(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS:
         _add_extent(table, fit, values[row + _RESIDUAL])
+    solver.moved_x = solver.moved_y = 0.0
+    if parts.states > 1 and last_x == last_x:
+        lag = 0.5 * (parts.states - 1)
+        solver.moved_x, solver.moved_y = lag * (fit.x - last_x), lag * (fit.y - last_y)
     _write_position(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and solver.pair_limits[pad] < _INFINITY:
         _resolve_pair(solver, pad)
@@ -194,6 +201,7 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
         parts[row + _PART_POSITION], parts[row + _PART_NORMAL] = at.px, at.nx
         parts[row + _PART_POSITION + 1], parts[row + _PART_NORMAL + 1] = at.py, at.ny
         parts[row + _PART_POSITION + 2], parts[row + _PART_NORMAL + 2] = at.pz, at.nz
+        _add_motion(solver, _PART_MOTION)
         _add_size(solver, pad)
         _add_overhang(solver, pad)
         _write_row(parts, row + _PART_COVARIANCE, fit, at, at.tx, at.wx)
@@ -390,11 +398,27 @@ def _write_position(solver: ContactSolver, pad: int) -> None:
     values[row + _U], values[row + _U + 1] = at.u_m, at.v_m
     values[row + _POSITION], values[row + _POSITION + 1], values[row + _POSITION + 2] = at.px, at.py, at.pz
     values[row + _NORMAL], values[row + _NORMAL + 1], values[row + _NORMAL + 2] = at.nx, at.ny, at.nz
+    _add_motion(solver, 1.0)
     _add_size(solver, pad)
     _add_overhang(solver, pad)
     _write_row(values, row + _COVARIANCE, fit, at, at.tx, at.wx)
     _write_row(values, row + _COVARIANCE + 3, fit, at, at.ty, at.wy)
     _write_row(values, row + _COVARIANCE + 6, fit, at, at.tz, at.wz)
+
+
+def _add_motion(solver: ContactSolver, factor: float) -> None:
+    """Add the covariance by motion in the course of a schedule of switched electrodes.
+
+    The states are those of different times: the position lags that of the last by what the contact has moved
+    since their middle, which isn't known better than by the last two positions.
+    """
+    fit = solver.fit
+    if solver.moved_x == 0.0 and solver.moved_y == 0.0:
+        return
+    moved_x, moved_y = factor * solver.moved_x, factor * solver.moved_y
+    fit.var_x += moved_x * moved_x
+    fit.var_y += moved_y * moved_y
+    fit.cov_xy += moved_x * moved_y
 
 
 def _add_size(solver: ContactSolver, pad: int) -> None:

@@ -11,6 +11,9 @@ cdef class PadTolerances:
     cdef double cell_ratio, aspect_std, wave_std, series_std, sheet_std, middle_u_m, size_x, size_y
     cdef double[::1] elongations, overhangs
     cdef double overhang_step_m
+    cdef Py_ssize_t states
+    cdef Py_ssize_t[::1] state_of
+    cdef double state_std, state_std_per_a
     cdef bint has_series, is_elongated, is_shape_exact
 
 cdef class PartKnowledge:
@@ -45,6 +48,10 @@ cdef void _begin(Whitening whitening) noexcept
 cdef void _add_contact(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
     double[::1] fractions, Py_ssize_t first, double[::1] weight, double total, double s, double t) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, state=Py_ssize_t, vector='double[::1]', by_state=double, std=double)
+cdef void _add_states(
+    Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
+    double total) noexcept
 @cython.locals(
     n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
     row=Py_ssize_t, vector='double[::1]', changes='double[::1]', axes='double[::1]',
@@ -58,7 +65,8 @@ cdef void apply_whitening(
 cdef void transpose_whitening(
     Whitening whitening, double[::1] values, double[::1] weight, double[::1] out) noexcept
 @cython.locals(
-    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, resistor=Py_ssize_t, columns=Py_ssize_t, changes='double[::1]',
+    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, resistor=Py_ssize_t, columns=Py_ssize_t, ends=Py_ssize_t,
+    field=Py_ssize_t, changes='double[::1]',
     fields='double[::1]')
 cdef void _add_changes(
     Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
@@ -68,7 +76,7 @@ cdef void _add_elongation(
     Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
 cdef void _add_second_derivatives(
-    Whitening whitening, double[::1] weight, double total, double std) noexcept
+    Whitening whitening, Py_ssize_t states, double[::1] weight, double total, double std) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)

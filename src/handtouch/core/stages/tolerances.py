@@ -19,16 +19,18 @@ class PadTolerances:
     """Tolerances of one pad of n electrodes, as standard deviations.
 
     values: nodes as `tables.read_values` needs them, over the pad in `cells` cells, each as many of the
-    forward model's as 1 / `cell_ratio`; columns are the fields of the 2 n ends of electrodes, then
-    derivatives of the n fractions by the logarithm of the ratio of the sides, by each wave of the sheet
-    resistance, by x x and by x y. end_vectors: (2 n n,) changes of fractions by one standard deviation of
-    each end, per its field. aspect_std, wave_std: of that logarithm, and of a wave. series_vectors: (n n,)
-    changes by the logarithm of each resistor, per its electrode's fraction; series_std, sheet_std: of the
-    logarithms of resistors and sheet resistance. middle_u_m: arc length from the electrode x0 to the pad's
-    middle; size_x, size_y: relative standard deviations of its sides. elongations: (cells + 1,) along x,
-    standard deviation of what an elongated contact multiplies derivatives by x x and x y with. overhangs:
-    (k,) root mean square shift [m] of positions from an edge that an elongated contact hangs over, at
-    multiples of `overhang_step_m` from it.
+    forward model's as 1 / `cell_ratio`; columns are the fields of the 2 n ends of electrodes, of each state
+    of a schedule, then derivatives of the n fractions by the logarithm of the ratio of the sides, by each
+    wave of the sheet resistance, by x x and by x y. end_vectors: (2 n n,) changes of fractions by one
+    standard deviation of each end, per its field. aspect_std, wave_std: of that logarithm, and of a wave.
+    series_vectors: (n n,) changes by the logarithm of each resistor, per its electrode's fraction;
+    series_std, sheet_std: of the logarithms of resistors and sheet resistance. middle_u_m: arc length from
+    the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its sides.
+    elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies derivatives
+    by x x and x y with. overhangs: (k,) root mean square shift [m] of positions from an edge that an
+    elongated contact hangs over, at multiples of `overhang_step_m` from it. states: of a schedule, 1 without
+    one; state_of: (n,) state in which each electrode is measured; state_std, state_std_per_a: of the
+    logarithm of a contact's current in each, by its force, and per ampere by the electrodes that it sees.
     """
 
     def __init__(
@@ -50,6 +52,10 @@ class PadTolerances:
         overhangs: memoryview[float],
         overhang_step_m: float,
         is_elongated: bool,
+        states: int,
+        state_of: memoryview[int],
+        state_std: float,
+        state_std_per_a: float,
         is_shape_exact: bool,
     ) -> None:
         self.values = values
@@ -62,6 +68,8 @@ class PadTolerances:
         self.middle_u_m, self.size_x, self.size_y = middle_u_m, size_x, size_y
         self.elongations, self.is_elongated = elongations, is_elongated
         self.overhangs, self.overhang_step_m = overhangs, overhang_step_m
+        self.states, self.state_of = states, state_of
+        self.state_std, self.state_std_per_a = state_std, state_std_per_a
         self.is_shape_exact = is_shape_exact  # none but gains have a tolerance
 
 
@@ -90,8 +98,8 @@ class PartKnowledge:
 class Whitening:
     """Whitening of currents over noise: `matrix` (n n,) is lower triangular; its product with currents that
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
-    to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (10 n,),
-    `changes` (p n,), `vector` (n,): working memory.
+    to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (8 n
+    and 2 n for each state,), `changes` (p n,), `vector` (n,): working memory.
     `electrodes` is n of the present pad, `channels` that of the pad with most.
     """
 
@@ -178,9 +186,9 @@ def whiten_elongated(
         whitening.matrix[i * n + i] += error * error
     _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
     _add_parts(whitening, pad, known, number)
-    ratio, columns = pad.cell_ratio, (5 + _WAVES) * n
+    ratio, columns = pad.cell_ratio, (2 * pad.states + 3 + _WAVES) * n
     tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, whitening.fields)
-    _add_second_derivatives(whitening, weight, total, moment_std)
+    _add_second_derivatives(whitening, pad.states, weight, total, moment_std)
     _invert_root(whitening.matrix, n)
 
 
@@ -236,10 +244,31 @@ def _add_contact(
         error = known.touch_errors[number] * total * weight[i]
         matrix[i * n + i] += error * error
         whitening.modelled[i] += total * fractions[first + i] * weight[i]
+    if pad.states > 1:
+        _add_states(whitening, pad, fractions, first, weight, total)
     if not pad.is_shape_exact:
         _add_changes(whitening, pad, fractions, first, weight, total, s, t)
     if pad.is_elongated:
         _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
+
+
+def _add_states(
+    whitening: Whitening,
+    pad: PadTolerances,
+    fractions: memoryview[float],
+    first: int,
+    weight: memoryview[float],
+    total: float,
+) -> None:
+    """Add the covariance by currents of a contact that differ from state to state of a schedule."""
+    n, vector, by_state = whitening.electrodes, whitening.vector, pad.state_std_per_a * total
+    std = math.sqrt(pad.state_std * pad.state_std + by_state * by_state)
+    for state in range(pad.states):
+        for i in range(n):
+            vector[i] = 0.0
+            if pad.state_of[i] == state:
+                vector[i] = std * total * fractions[first + i] * weight[i]
+        _add_square(whitening)
 
 
 def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, number: int) -> None:
@@ -303,15 +332,17 @@ def _add_changes(
 ) -> None:
     """Add the changes of the currents over noise by one standard deviation of each part."""
     n, changes, fields = whitening.electrodes, whitening.changes, whitening.fields
-    columns, ratio = (5 + _WAVES) * n, pad.cell_ratio
+    ends, ratio = 2 * pad.states * n, pad.cell_ratio
+    columns = ends + (3 + _WAVES) * n
     tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, fields)
     for i in range(n):
         scale = total * weight[i]
+        field = 2 * n * pad.state_of[i]
         for k in range(2 * n):
-            changes[k * n + i] += pad.end_vectors[k * n + i] * fields[k] * scale
-        changes[2 * n * n + i] += pad.aspect_std * fields[2 * n + i] * scale
+            changes[k * n + i] += pad.end_vectors[k * n + i] * fields[field + k] * scale
+        changes[2 * n * n + i] += pad.aspect_std * fields[ends + i] * scale
         for k in range(_WAVES):
-            changes[(2 * n + 1 + k) * n + i] += pad.wave_std * fields[(3 + k) * n + i] * scale
+            changes[(2 * n + 1 + k) * n + i] += pad.wave_std * fields[ends + (1 + k) * n + i] * scale
         if pad.has_series:
             resistor = (2 * n + 1 + _WAVES) * n + i
             together = 0.0
@@ -336,17 +367,17 @@ def _add_elongation(
         cell = pad.cells - 1
     beyond = s - cell
     std = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
-    _add_second_derivatives(whitening, weight, total, std)
+    _add_second_derivatives(whitening, pad.states, weight, total, std)
 
 
 def _add_second_derivatives(
-    whitening: Whitening, weight: memoryview[float], total: float, std: float
+    whitening: Whitening, states: int, weight: memoryview[float], total: float, std: float
 ) -> None:
     """Add the covariance by second derivatives, which are in `fields`, with amplitudes of deviation `std`."""
     n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
     for k in range(2):
         for i in range(n):
-            vector[i] = std * fields[(3 + _WAVES + k) * n + i] * total * weight[i]
+            vector[i] = std * fields[(2 * states + 1 + _WAVES + k) * n + i] * total * weight[i]
         _add_square(whitening)
 
 

@@ -18,14 +18,27 @@ _DAEMON_TIMEOUT_S = 0.5
 
 
 def select_rows(deployment: config.Deployment, patterns: Sequence[str]) -> list[int]:
-    """Return the rows of the pads that match patterns (default: all). Raises ConfigError for one without."""
+    """Return the rows of the pads that match patterns (default: all that can be commissioned).
+
+    Raises ConfigError for a pattern without a pad, or with one whose electrodes are switched: each of its
+    channels has several.
+    """
+    switched = {row for row, (_, pad) in enumerate(deployment.pads) if pad.switch_states}
     if not patterns:
-        return list(range(len(deployment.pads)))
+        return [row for row in range(len(deployment.pads)) if row not in switched]
     rows: set[int] = set()
     for pattern in patterns:
         matching = deployment.rows_matching(pattern)
         if not matching:
             remedy = f"matches no pad; pads: {', '.join(deployment.pad_names)}"
+            raise config.ConfigError(
+                "handtouch commission", (config.Problem("--link", f" {pattern}", remedy),)
+            )
+        if refused := switched & {*matching}:
+            remedy = (
+                f"has switch_states, {deployment.pad_names[min(refused)]}: a press doesn't show which "
+                "electrode a shared channel is wired to; write electrodes into the file by the wiring diagram"
+            )
             raise config.ConfigError(
                 "handtouch commission", (config.Problem("--link", f" {pattern}", remedy),)
             )

@@ -21,7 +21,7 @@ from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import STALE_PERIODS, Master
-from handtouch.canbus.nodes.spec import NodeStatus, node_specs
+from handtouch.canbus.nodes.spec import NodeStatus, node_specs, sync_overflows
 from handtouch.core.slab import Slab
 from handtouch.procedures.commission.deployment_edit import PadEdit, apply_edits
 
@@ -29,10 +29,15 @@ _MIN_STALE_AFTER_NS = 100_000_000  # late and lost samples don't end a press
 
 
 def with_default_wiring(deployment: config.Deployment) -> config.Deployment:
-    """Return the deployment with channels in the nodes' own order, and without serial numbers."""
+    """Return the deployment with channels in the nodes' own order, and without serial numbers.
+
+    Those of pads with a schedule keep their order, which says when each is measured.
+    """
     edits = {
         (entry.hand, entry.pad.link): replace(
-            PadEdit.from_pad(entry.pad), serial=None, electrodes=entry.pad.electrode_names
+            PadEdit.from_pad(entry.pad),
+            serial=None,
+            electrodes=entry.pad.electrodes if entry.pad.switch_states else entry.pad.electrode_names,
         )
         for entry in deployment.pads
     }
@@ -68,7 +73,7 @@ def open_sample_source(deployment: config.Deployment) -> Iterator[CanSampleSourc
             ports[bus.name] = port = Port.open(bus, slab)
             stack.callback(port.close)
         master = Master(ports, specs, period_ns)
-        sync = Sync(list(ports.values()), period_ns)
+        sync = Sync(list(ports.values()), period_ns, sync_overflows(deployment))
         now_ns = time.monotonic_ns()
         master.start(now_ns)
         stack.callback(lambda: master.stop(time.monotonic_ns()))
