@@ -453,6 +453,13 @@ def test_torn_corner_is_diagnosed_with_its_size(series_ohm: float) -> None:
     assert found.values["along_y_mm"] == pytest.approx(14, abs=5)
 
 
+def test_dead_electrode_is_diagnosed_by_contacts_behind_resistors() -> None:
+    """Contacts all over the pad seem to lie along one side, close to each other: they count as different."""
+    fault: dict[str, object] = {"kind": "dead_electrode", "link": LINK, "from_s": 0.0, "electrode": "y0"}
+    (found,) = simulate(fault, 30, (1000.0,) * 4)
+    assert (found.kind, found.electrodes) == (FaultKind.DEAD_ELECTRODE, ("y0",))
+
+
 def test_shorted_electrodes_are_observable_with_resistors() -> None:
     fault = {"kind": "shorted_electrode", "link": LINK, "from_s": 0.0, "electrode": "x0", "to": "y0"}
     (found,) = simulate(fault, 60, series_ohm=(500.0,) * 4)

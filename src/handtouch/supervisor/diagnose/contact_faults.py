@@ -63,6 +63,8 @@ _TOLERANCE_WIDENING = 1.2
 _MIN_UNEXPLAINED_SHARE, _MAX_EXPLAINED_SHARE = 0.65, 0.35
 """Share of contacts that are no points, at which they are unexplained, and at which that ends."""
 _SIMILAR_KINDS = {FaultKind.GAIN_STEP, FaultKind.TORN_CORNER}
+_MAX_SILENT_FRACTION, _SHARE_CELLS = 0.005, 16
+"""Of the total current, in a channel that carries nothing; cells of each share of such a contact."""
 _MIN_CONTACTS_SIMILAR = 12
 """Contacts of a fault of free size: fewer fit one of the sizes now and then."""
 _KINDS_WITH_ALTERNATIVES = (*_SIMILAR_KINDS, FaultKind.SWAPPED_CABLES)
@@ -95,8 +97,20 @@ class _RememberedContact:
 
     def __init__(self, contact: ContactCurrents) -> None:
         self.contact = contact
-        self.cell = int(8 * contact.position[0]), int(8 * contact.position[1])
+        self.cell = _cell(contact)
         self.scores: dict[int | None, Scores] = {}
+
+
+def _cell(contact: ContactCurrents) -> tuple[int, ...]:
+    """Return a number for contacts that are much the same: those beside each other on the pad.
+
+    If a channel carries nothing, as that of a dead electrode, the position of a healthy pad is at the
+    opposite side all the time: then those that share their current alike among the others.
+    """
+    shares = contact.currents / max(float(contact.currents.sum()), 1e-30)
+    if np.abs(shares).min() < _MAX_SILENT_FRACTION:
+        return int(np.abs(shares).argmin()), *(_SHARE_CELLS * shares).astype(int).tolist()
+    return int(8 * contact.position[0]), int(8 * contact.position[1])
 
 
 class ContactFaultDetector:
