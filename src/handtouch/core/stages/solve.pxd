@@ -7,6 +7,7 @@ cdef Py_ssize_t _COVARIANCE, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _COUNT
 cdef Py_ssize_t _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD
 cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT
 cdef double _TWO_PI, _INFINITY
+cdef double _PART_MOTION, _MOTION_ALONG, _MOTION_ACROSS
 cdef double _NAN, _VALID, _LOWER_BOUND, _BOUND_SIGMA, _MAX_SQUARED_MISFIT, _MAX_EXTENT_SIDES
 cdef Py_ssize_t _PAIRED_CHANNELS
 
@@ -48,7 +49,7 @@ cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) no
 cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(row=Py_ssize_t, fit=locate.Fit, at=tables.Placement, values='double[::1]')
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(fit=locate.Fit, moved_x=double, moved_y=double)
+@cython.locals(fit=locate.Fit, moved_x=double, moved_y=double, along2=double, across2=double)
 cdef void _add_motion(ContactSolver solver, double factor) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, parts=tolerances.PadTolerances)
 cdef void _add_size(ContactSolver solver, Py_ssize_t pad) noexcept

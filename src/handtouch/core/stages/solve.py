@@ -60,6 +60,9 @@ that explains the residual."""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
 _TWO_PI, _INFINITY = 2.0 * math.pi, math.inf
+_MOTION_ALONG, _MOTION_ACROSS = 0.8, 0.3
+"""Standard deviations of a position along and across the path, in what a contact moves in a schedule: by
+coverage at 30 mm/s in the world `default`, tuning family."""
 _PART_MOTION = 2.0  # of one of two contacts that moves, in motions of the single contact that explains both
 _PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 
@@ -161,7 +164,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
         _add_extent(table, fit, values[row + _RESIDUAL])
     solver.moved_x = solver.moved_y = 0.0
     if parts.states > 1 and last_x == last_x:
-        lag = 0.5 * (parts.states - 1)
+        lag = 1.0 * (parts.states - 1)
         solver.moved_x, solver.moved_y = lag * (fit.x - last_x), lag * (fit.y - last_y)
     _write_position(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and solver.pair_limits[pad] < _INFINITY:
@@ -409,16 +412,18 @@ def _write_position(solver: ContactSolver, pad: int) -> None:
 def _add_motion(solver: ContactSolver, factor: float) -> None:
     """Add the covariance by motion in the course of a schedule of switched electrodes.
 
-    The states are those of different times: the position lags that of the last by what the contact has moved
-    since their middle, which isn't known better than by the last two positions.
+    The states are those of different times: the position lags that of the last, depending on what each state
+    says, and shifts sideways, as the states contradict each other. What the contact has moved isn't
+    known better than by the last two positions.
     """
     fit = solver.fit
     if solver.moved_x == 0.0 and solver.moved_y == 0.0:
         return
     moved_x, moved_y = factor * solver.moved_x, factor * solver.moved_y
-    fit.var_x += moved_x * moved_x
-    fit.var_y += moved_y * moved_y
-    fit.cov_xy += moved_x * moved_y
+    along2, across2 = _MOTION_ALONG * _MOTION_ALONG, _MOTION_ACROSS * _MOTION_ACROSS
+    fit.var_x += along2 * moved_x * moved_x + across2 * moved_y * moved_y
+    fit.var_y += along2 * moved_y * moved_y + across2 * moved_x * moved_x
+    fit.cov_xy += (along2 - across2) * moved_x * moved_y
 
 
 def _add_size(solver: ContactSolver, pad: int) -> None:
