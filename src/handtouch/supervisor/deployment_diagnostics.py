@@ -64,7 +64,7 @@ class DeploymentDiagnostics:
             self._diagnoses += [
                 (rows.start + row, diagnosis.published)
                 for row, diagnosis in hand.diagnoses_by_pad()
-                if diagnosis.is_fault
+                if diagnosis.is_fault and not self._switched[rows.start + row]
             ]
         return self._diagnoses
 
@@ -74,6 +74,7 @@ class DeploymentDiagnostics:
             rows.start + row: electrode
             for rows, hand in self._hands
             for row, electrode in hand.dead_electrodes().items()
+            if not self._switched[rows.start + row]
         }
 
     def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
