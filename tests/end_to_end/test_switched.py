@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
+import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +26,7 @@ from handtouch.device import Device, DeviceBus
 from handtouch.device.faults import LineFaults
 from handtouch.field import PerimeterNetwork, ScheduledNetwork
 from handtouch.hand import pad_network
+from handtouch.record.recording import Recording
 
 from .conftest import run_in_threads
 
@@ -179,3 +183,34 @@ def test_gains_of_shared_channels_are_not_learned(served: Served) -> None:
         return texts[-1] if texts and "switch_states" in texts[-1] else None
 
     assert "gains aren't learned" in served.wait("reported", reported)
+
+
+def test_a_recording_of_a_switched_pad_is_replayed_bit_for_bit(rig: Any) -> None:
+    settings = rig.config.read_text().partition("[[bus]]")[0]
+    rig.config.write_text(
+        settings + "[[bus]]" + shipped.path("switched.toml").read_text().partition("[[bus]]")[2]
+    )
+    rig.scenario.write_text(
+        'repeat = true\npause_s = 0.5\n[[touch]]\nlink = "tip"\nfrom_s = 1.0\nduration_s = 2.0\n'
+        "path = [[0.3, 0.4], [0.5, 0.5]]\nforce_n = [1.0]\n"
+    )
+    rig.simulate()
+    rig.start("run")
+    rig.wait_operational(2)
+    out, report = rig.folder / "session.mcap", rig.folder / "report.json"
+    recorder = subprocess.Popen(
+        rig.command("record", str(rig.config), "-o", str(out)), stderr=subprocess.PIPE, text=True
+    )
+    rig.wait("recorded", lambda status: "tick" in status["service"]["subscriptions"])
+    time.sleep(8.0)
+    assert rig.end("run") == 0
+    recorder.send_signal(signal.SIGINT)
+    _, err = recorder.communicate(timeout=MAX_WAIT_S)
+    replayed = subprocess.run(
+        rig.command("replay", str(out), "--report", str(report)), capture_output=True, text=True, check=False
+    )
+    assert replayed.returncode == 0, replayed.stderr + err
+    outcome = json.loads(report.read_text())
+    assert outcome["equal"] == outcome["compared"] > 20
+    contacts = [entry.payload for entry in Recording(out).read("contact")]
+    assert any(contact.get("position_status") == "valid" for contact in contacts)
