@@ -165,7 +165,7 @@ class ChannelFaultDetector:
         others = features.mean_counts[:, pad, own][:, healthy]
         least = self._min_counts[pad, channel, own][healthy]
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
-        if count > 0 and self._is_short(pad, channel, healthy, least):
+        if count > 0 and self._is_short(pad, channel, healthy, least, lasted):
             return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
         untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
         if untouched or count < 0:
@@ -174,12 +174,16 @@ class ChannelFaultDetector:
             return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence, _TOUCHED_CONFIDENCE)
         return None
 
-    def _is_short(self, pad: int, channel: int, healthy: NDArray[np.bool_], least: FloatArray) -> bool:
+    def _is_short(
+        self, pad: int, channel: int, healthy: NDArray[np.bool_], least: FloatArray, lasted_ns: int
+    ) -> bool:
         """Return whether the lowest counts of healthy channels (c,) are those of a short of `channel`.
 
-        Also of a pad with one dead electrode: its channel is silent, the others carry its part.
+        Also of a pad with one dead electrode: its channel is silent, the others carry its part; after a time
+        that contacts don't last, as one on a long pad may leave a far channel silent.
         """
         silent = np.abs(least) < _MAX_SILENT_SIGMA * self._model.reading_noise_counts[pad]
+        silent &= lasted_ns > _MIN_RAILED_TOUCHED_NS
         if len(least) - silent.sum() < _MIN_CHANNELS_OF_SHORT or silent.sum() > 1:
             return False
         expected = self._idle_counts[pad][channel]
