@@ -408,7 +408,7 @@ def main() -> None:
         lambda: position_figures(1 if quick else 4, 4 if quick else 20, workers),
         lambda: radius_figures(1 if quick else 4, 4 if quick else 20, workers),
         lambda: sheet_figures(0.5 if quick else 4.0, 4 if quick else SHEET_PADS, workers),
-        lambda: gum_figures(2 if quick else 20, workers),
+        lambda: gum_figures(2 if quick else 16, workers),
         lambda: gain_figures(2 if quick else 60),
         lambda: location_figures(2 if quick else 3, 10.0 if quick else math.inf),
     ]

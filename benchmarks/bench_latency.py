@@ -514,7 +514,7 @@ Parts of the daemon's latency with sliding contacts, from a traced pass (medians
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--seconds", type=float, default=8.0, help="of a turn")
+    parser.add_argument("--seconds", type=float, default=6.0, help="of a turn")
     parser.add_argument("--turns", type=int, default=3)
     asked = parser.parse_args()
     if not VCAN.exists():
