@@ -223,8 +223,8 @@ full rate.
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each case")
-    parser.add_argument("--trials", type=int, default=50, help="touches of an idle hand")
+    parser.add_argument("--seconds", type=float, default=6.0, help="of each case")
+    parser.add_argument("--trials", type=int, default=30, help="touches of an idle hand")
     asked = parser.parse_args()
     if asked.quick:
         asked.seconds, asked.trials = 1.0, 3

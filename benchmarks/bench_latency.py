@@ -21,7 +21,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -48,6 +48,7 @@ from handtouch.simulate.worlds import WORLDS, Family
 CHANNEL, PORT = "239.74.163.9", 43999
 VCAN = Path("/sys/class/net/vcan0")
 TOUCHED = 5
+TOUCH_TIMEOUT_S = 60.0
 ROUND_S = 5.0
 SETTLED_S = 6.0
 """Wait after the first contacts: the supervisor process starts, which loads one CPU for 3 s"""
@@ -82,7 +83,7 @@ def open_bus() -> can.BusABC:
     return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
 
 
-def film(deployment: Deployment, path: str, touched: Sequence[int] = range(TOUCHED)) -> NDArray[np.int64]:
+def film(deployment: Deployment, path: str, touched: Iterable[int] = range(TOUCHED)) -> NDArray[np.int64]:
     """Return counts (k, pads, 4), one sample per SYNC: contacts slide along the path and back."""
     links = [pad.link for hand in deployment.hands for pad in hand.pads]
     touches = "\n".join(
@@ -220,14 +221,23 @@ def sync_of(parts: list[bytes]) -> int | None:
     return None if frame.retained else frame.t_ns
 
 
-def wait_for_touch(socket: zmq.Socket[bytes]) -> None:
-    """Wait until TOUCHED pads are touched, and a while longer; the floor is ready with its first message."""
+def wait_for_touch(socket: zmq.Socket[bytes], touched: int = TOUCHED) -> None:
+    """Wait until so many pads are touched, and a while longer; the floor is ready with its first message.
+
+    Raises:
+        TimeoutError: they are not touched within TOUCH_TIMEOUT_S.
+    """
+    give_up_s = time.monotonic() + TOUCH_TIMEOUT_S
     while True:
+        if time.monotonic() > give_up_s:
+            raise TimeoutError(f"no frame of {touched} touched pads came within {TOUCH_TIMEOUT_S:.0f} s")
+        if not socket.poll(1000):
+            continue
         parts = socket.recv_multipart()
         if parts[0] == FLOOR_ID:
             break
         frame = wire.decode(parts)
-        if isinstance(frame, wire.HandFrame) and frame.state.count(wire.PadState.TOUCHED) == TOUCHED:
+        if isinstance(frame, wire.HandFrame) and frame.state.count(wire.PadState.TOUCHED) == touched:
             receive(socket, SETTLED_S)
             return
     receive(socket, 1.0)

@@ -162,8 +162,8 @@ def sample_at_sync(node: Node, bus: can.BusABC, seconds: float) -> dict[str, Any
 
 def main() -> int:
     parser = options(__doc__)
-    parser.add_argument("--seconds", type=float, default=30.0, help="of SYNC in each mode")
-    parser.add_argument("--runs", type=int, default=5, help="starts to time")
+    parser.add_argument("--seconds", type=float, default=15.0, help="of SYNC in each mode")
+    parser.add_argument("--runs", type=int, default=3, help="starts to time")
     asked = parser.parse_args()
     if not Path("/sys/class/net/vcan0").exists() and "VCAN_RUN" not in os.environ:
         root = Path(__file__).parents[1]

@@ -509,8 +509,8 @@ Slips by what makes them hard to detect, each in the first row that fits:
 | --- | --- | --- |
 {kind_rows}
 
-A slip counts for the detector from 0.35 mm, unless it is fast, so it doesn't detect most of the first row by
-design. False alarms by cause, in all grasps: {causes}.
+A slip counts for the detector from 0.35 mm, unless it is fast. False alarms by cause, in all
+grasps: {causes}.
 
 ## Stiffness
 

@@ -31,6 +31,7 @@ from bench_latency import (
     MOST,
     PATHS,
     PORT,
+    TOUCHED,
     ProcessorShare,
     Turn,
     film,
@@ -150,11 +151,11 @@ def case(config: Path, pid: int, stamps: Any, seconds: float, name: str) -> dict
 
 
 @contextmanager
-def serving(config: Path) -> Iterator[tuple[int, Any]]:
-    """Run simulated nodes and the daemon from the first touch on; yield its process and send times."""
+def serving(config: Path, touched: int = TOUCHED) -> Iterator[tuple[int, Any]]:
+    """Run simulated nodes and the daemon from when pads are touched; yield its process and send times."""
     deployment = load(config)
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
-    samples = film(deployment, PATHS["sliding"])
+    samples = film(deployment, PATHS["sliding"], range(touched))
     worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
     worker.start()
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
@@ -164,7 +165,7 @@ def serving(config: Path) -> Iterator[tuple[int, Any]]:
             socket.setsockopt(zmq.LINGER, 0)
             socket.subscribe("hand/")
             socket.connect(deployment.daemon.live)
-            wait_for_touch(socket)
+            wait_for_touch(socket, touched)
         yield daemon.pid, stamps
     finally:
         daemon.terminate()

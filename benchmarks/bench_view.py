@@ -27,7 +27,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import bench_latency
 from bench_latency import (
     PORT,
     ProcessorShare,
@@ -51,6 +50,7 @@ NO_SUBSCRIBER, READER, VIEW, PAGE, BROWSER, PERCEPTS = (
     "the view --percepts, a page that only reads",
 )
 RATE_HZ = 200
+ALL = 15  # pads are touched: the most that there is to show
 JOINING_S = 2.0
 JOINTS = ("index_mcp", "index_pip", "index_dip", "middle_mcp", "ring_mcp", "thumb_cmc")
 
@@ -196,11 +196,10 @@ def send_joints(endpoint: str, stop: threading.Event) -> None:
 
 def measure(config: Path, turns: int, seconds: float, packages: Path | None) -> Rows:
     """Run all cases repeatedly with one daemon."""
-    bench_latency.TOUCHED = 15  # of the film: the most that there is to show
     still = threading.Event()
     robot = threading.Thread(target=send_joints, args=(load(config).daemon.inputs, still))
     cases = (NO_SUBSCRIBER, READER, VIEW, PAGE, *([BROWSER] if packages else []), PERCEPTS)
-    with serving(config) as (pid, _):
+    with serving(config, ALL) as (pid, _):
         robot.start()
         try:
             return in_turns(turns, cases, lambda name: case(config, pid, seconds, name, packages))
@@ -248,7 +247,7 @@ def page_of(results: dict[str, Any]) -> str:
     return f"""# The view
 
 A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, with joint states at 100 Hz. Medians of
-{turns} rounds through all cases, {results["seconds"]:.0f} s each.
+{turns} round{"s" * (turns > 1)} through all cases, {results["seconds"]:.0f} s each.
 {results["machine"]}; load average when it ended {results["load"]:.1f}.
 
 | subscriber | loop, ms per tick | share of a core | ratio to reader | latency, ms | ticks/s | view \
