@@ -167,6 +167,23 @@ class Rig:
             lambda status: sum(pad["node_state"] == "operational" for pad in status["pads"]) == count,
         )
 
+    @contextlib.contextmanager
+    def recording(self) -> Iterator[Path]:
+        """Record what the daemon publishes in the block, after which it ends; the recording's file."""
+        out = self.folder / "session.mcap"
+        self.start_command("record", str(self.config), "-o", str(out))
+        self.wait("recorded", lambda status: "tick" in status["service"]["subscriptions"])
+        yield out
+        assert self.end("run") == 0, self.all_printed()
+        self.end("record", signal.SIGINT)
+
+    def replay(self, recording: Path) -> dict[str, Any]:
+        """Replay a recording; the report of the comparison."""
+        report = self.folder / "report.json"
+        status, printed = self.call("replay", str(recording), "--report", str(report))
+        assert status == 0, printed + self.all_printed()
+        return dict(json.loads(report.read_text()))
+
     def all_printed(self) -> str:
         return "\n".join(f"--- {path.name}\n{path.read_text()}" for path in self.folder.glob("*.txt"))
 

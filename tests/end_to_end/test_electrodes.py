@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 from handtouch import wire
 from handtouch.canbus.bus.port import open_bus
 from handtouch.cli.demo import in_process_deployment
-from handtouch.client import connect, request
+from handtouch.client import request
 from handtouch.config import Deployment, parse
 from handtouch.config.channels import resolve_channels
 from handtouch.daemon.daemon import HandtouchDaemon
@@ -24,9 +22,8 @@ from handtouch.hand import pad_network, pad_surface
 from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
 
 from .conftest import run_in_threads
+from .served_daemon import MAX_WAIT_S, ServedDaemon
 
-MAX_WAIT_S = 90.0
-"""Upper limit of every wait."""
 PRESS_SYNCS, REST_SYNCS = 20, 10
 DEAD = 3
 LINKS = ("three", "six")
@@ -87,30 +84,12 @@ class Nodes:
         return 1e3 * float(np.linalg.norm(np.subtract(contact.position_m, true)))
 
 
-class Served:
-    """The daemon, the nodes, and what it has published."""
+class Served(ServedDaemon):
+    """The daemon with its nodes."""
 
     def __init__(self, daemon: HandtouchDaemon, nodes: Nodes) -> None:
-        self.daemon, self.nodes = daemon, nodes
-        self.contacts: list[wire.Contact] = []
-        self.health: list[wire.Health] = []
-
-    def listen(self, stop: threading.Event) -> None:
-        endpoint = self.daemon.publisher.endpoints["complete"]
-        with connect("contact/*/*", "health/*/*", endpoint=endpoint, key="", queue=100_000) as messages:
-            while not stop.is_set():
-                message = messages.recv(0.1)
-                if isinstance(message, wire.Contact):
-                    self.contacts.append(message)
-                elif isinstance(message, wire.Health):
-                    self.health.append(message)
-
-    def wait(self, what: str, met: Callable[[], Any]) -> Any:
-        end_s = time.monotonic() + MAX_WAIT_S
-        while not (found := met()):
-            assert time.monotonic() < end_s, f"never {what}"
-            time.sleep(0.05)
-        return found
+        super().__init__(daemon)
+        self.nodes = nodes
 
     def errors_mm(self, link: str, after_ns: int = 0) -> list[float] | None:
         """Return the errors of valid positions since then; None before there are fifty."""

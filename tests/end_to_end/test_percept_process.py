@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from handtouch import wire
 from handtouch.cli.demo import in_process_deployment
-from handtouch.client import connect, request
+from handtouch.client import request
 from handtouch.config import Deployment, parse
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.host.process import process_statistics
@@ -24,8 +22,9 @@ from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 
 from .conftest import run_in_threads
+from .served_daemon import MAX_WAIT_S, ServedDaemon
 
-PERIOD_MS, MAX_WAIT_S = 5.0, 90.0
+PERIOD_MS = 5.0
 MAX_GROWTH_BYTES = 32 << 20
 SCENARIO = """
 repeat = true
@@ -47,35 +46,16 @@ force_n = [1.5]
 """
 
 
-class Bench:
-    """A running daemon, and the messages that it has published."""
+class Bench(ServedDaemon):
+    """The daemon with its percept process."""
 
     def __init__(self, daemon: HandtouchDaemon) -> None:
-        self.daemon = daemon
-        self.contacts: list[wire.Contact] = []
-        self.percepts: list[wire.Percept] = []
-
-    def listen(self, stop: threading.Event) -> None:
-        endpoint = self.daemon.publisher.endpoints["complete"]
-        topics = "contact/*/*", "percept/*/motion", "percept/*/shape"
-        with connect(*topics, endpoint=endpoint, key="", queue=100_000) as messages:
-            while not stop.is_set():
-                message = messages.recv(0.1)
-                if isinstance(message, wire.Contact):
-                    self.contacts.append(message)
-                elif isinstance(message, wire.Percept):
-                    self.percepts.append(message)
+        super().__init__(daemon, "contact/*/*", "percept/*/motion", "percept/*/shape")
 
     @property
     def process(self) -> dict[str, Any]:
         """State of the percept process, as in `service`."""
         return dict(self.daemon.percepts.client.statistics())
-
-    def wait(self, what: str, met: Callable[[], Any]) -> None:
-        end_s = time.monotonic() + MAX_WAIT_S
-        while not met():
-            assert time.monotonic() < end_s, f"never {what}: {self.process}"
-            time.sleep(0.02)
 
     def wait_percepts(self, kind: str, count: int = 3) -> None:
         """Wait for percepts of a kind about samples from now on."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
 import time
 from typing import Any
 
@@ -19,10 +16,6 @@ def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> 
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
-    out, report = rig.folder / "session.mcap", rig.folder / "report.json"
-    recorder = subprocess.Popen(
-        rig.command("record", str(rig.config), "-o", str(out)), stderr=subprocess.PIPE, text=True
-    )
 
     def send_request(command: str, **arguments: Any) -> None:
         request(command, endpoint=rig.endpoints["control"], timeout_s=LONGEST_S, **arguments)
@@ -31,7 +24,7 @@ def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> 
         status = request("status", endpoint=rig.endpoints["control"], timeout_s=LONGEST_S)
         return int(status["service"]["contacts"])
 
-    with Robot(rig.endpoints["inputs"]) as robot:
+    with rig.recording() as out, Robot(rig.endpoints["inputs"]) as robot:
         assert robot.wait_connected(LONGEST_S)
 
         def wait_for_contacts(count: int) -> None:
@@ -41,7 +34,6 @@ def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> 
                 robot.send_joints("right", {"index_mcp": 0.4, "index_pip": 0.5}, t_ns=time.monotonic_ns())
                 time.sleep(0.01)
 
-        rig.wait("recorded", lambda status: "tick" in status["service"]["subscriptions"])
         send_request("scene", outputs=["position", "force", "palm", "base"])
         wait_for_contacts(2)
         send_request("calibrate", pad="palm_heel", name="other", gains=[1.1, 1.0, 1.0, 1.0])
@@ -51,14 +43,7 @@ def test_a_recording_with_control_requests_is_replayed_bit_for_bit(rig: Any) -> 
         send_request("disable", pads=["index_distal"])
         send_request("reload")
         wait_for_contacts(1)
-    assert rig.end("run") == 0
-    recorder.send_signal(signal.SIGINT)
-    _, err = recorder.communicate(timeout=LONGEST_S)
-    replayed = subprocess.run(
-        rig.command("replay", str(out), "--report", str(report)), capture_output=True, text=True, check=False
-    )
-    assert replayed.returncode == 0, replayed.stderr + err
-    outcome = json.loads(report.read_text())
+    outcome = rig.replay(out)
     assert outcome["equal"] == outcome["compared"] > 20
     contacts = [entry.payload for entry in Recording(out).read("contact")]
     assert {"other"} < {contact["calibration_id"] for contact in contacts}

@@ -5,10 +5,8 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +27,9 @@ from tests.deployments import deployment_text, pad_text
 from tests.wire.schema_check import SchemaCheck
 
 from .conftest import run_in_threads
+from .served_daemon import MAX_WAIT_S, ServedDaemon
 
 PERIOD_MS = 5.0
-MAX_WAIT_S = 60.0
-"""Upper limit of every wait."""
 DEPLOYMENT = deployment_text(
     daemon=f'sync_period_ms = {PERIOD_MS}\nsample_window_fraction = 0.9\nstore = "calibrations.db"',
     channel="x",
@@ -84,36 +81,12 @@ force_n = [1.5]
 """
 
 
-@dataclass
-class Bench:
-    """A running daemon, and the messages that it has published."""
+class Bench(ServedDaemon):
+    """The daemon with its hand and its store of calibrations."""
 
-    daemon: HandtouchDaemon
-    hand: SimulatedHand
-    store: Path
-    contacts: list[wire.Contact] = field(default_factory=list)
-    health: list[wire.Health] = field(default_factory=list)
-    malformed: int = 0
-
-    def listen(self, stop: threading.Event) -> None:
-        endpoint = self.daemon.publisher.endpoints["complete"]
-        with connect("contact/*/*", "health/*/*", endpoint=endpoint, key="", queue=100_000) as messages:
-            while not stop.is_set():
-                message = messages.recv(0.1)
-                if isinstance(message, wire.Contact):
-                    self.contacts.append(message)
-                elif isinstance(message, wire.Health):
-                    self.health.append(message)
-                self.malformed = messages.malformed_messages
-
-    def wait(self, what: str, met: Callable[[], Any]) -> Any:
-        end_s = time.monotonic() + MAX_WAIT_S
-        while not (found := met()):
-            assert time.monotonic() < end_s, (
-                f"never {what}: {self.daemon.reporter.status(time.monotonic_ns())}"
-            )
-            time.sleep(0.05)
-        return found
+    def __init__(self, daemon: HandtouchDaemon, hand: SimulatedHand, store: Path) -> None:
+        super().__init__(daemon)
+        self.hand, self.store = hand, store
 
     @property
     def figures(self) -> dict[str, Any]:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import signal
-import subprocess
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +13,6 @@ from numpy.typing import NDArray
 from handtouch import wire
 from handtouch.canbus.bus.port import open_bus
 from handtouch.cli.demo import in_process_deployment
-from handtouch.client import connect
 from handtouch.config import Deployment, load, shipped
 from handtouch.config.channels import resolve_channels
 from handtouch.daemon.daemon import HandtouchDaemon
@@ -29,8 +23,8 @@ from handtouch.hand import pad_network
 from handtouch.record.recording import Recording
 
 from .conftest import run_in_threads
+from .served_daemon import ServedDaemon
 
-MAX_WAIT_S = 90.0
 PRESS_SYNCS, REST_SYNCS = 30, 10
 
 
@@ -75,30 +69,12 @@ class Finger:
         return np.rint(counts).astype(np.int64)
 
 
-class Served:
-    """The daemon, the nodes, and what it has published."""
+class Served(ServedDaemon):
+    """The daemon with its nodes."""
 
     def __init__(self, daemon: HandtouchDaemon, finger: Finger) -> None:
-        self.daemon, self.finger = daemon, finger
-        self.contacts: list[wire.Contact] = []
-        self.health: list[wire.Health] = []
-
-    def listen(self, stop: threading.Event) -> None:
-        endpoint = self.daemon.publisher.endpoints["complete"]
-        with connect("contact/*/*", "health/*/*", endpoint=endpoint, key="", queue=100_000) as messages:
-            while not stop.is_set():
-                message = messages.recv(0.1)
-                if isinstance(message, wire.Contact):
-                    self.contacts.append(message)
-                elif isinstance(message, wire.Health):
-                    self.health.append(message)
-
-    def wait(self, what: str, met: Callable[[], Any]) -> Any:
-        end_s = time.monotonic() + MAX_WAIT_S
-        while not (found := met()):
-            assert time.monotonic() < end_s, f"never {what}"
-            time.sleep(0.05)
-        return found
+        super().__init__(daemon)
+        self.finger = finger
 
     def updates(self, count: int) -> list[wire.Contact]:
         """Wait for so many further updates."""
@@ -197,20 +173,9 @@ def test_a_recording_of_a_switched_pad_is_replayed_bit_for_bit(rig: Any) -> None
     rig.simulate()
     rig.start("run")
     rig.wait_operational(2)
-    out, report = rig.folder / "session.mcap", rig.folder / "report.json"
-    recorder = subprocess.Popen(
-        rig.command("record", str(rig.config), "-o", str(out)), stderr=subprocess.PIPE, text=True
-    )
-    rig.wait("recorded", lambda status: "tick" in status["service"]["subscriptions"])
-    time.sleep(8.0)
-    assert rig.end("run") == 0
-    recorder.send_signal(signal.SIGINT)
-    _, err = recorder.communicate(timeout=MAX_WAIT_S)
-    replayed = subprocess.run(
-        rig.command("replay", str(out), "--report", str(report)), capture_output=True, text=True, check=False
-    )
-    assert replayed.returncode == 0, replayed.stderr + err
-    outcome = json.loads(report.read_text())
+    with rig.recording() as out:
+        rig.wait("touched twice", lambda status: status["service"]["contacts"] >= 2)
+    outcome = rig.replay(out)
     assert outcome["equal"] == outcome["compared"] > 20
     contacts = [entry.payload for entry in Recording(out).read("contact")]
     assert any(contact.get("position_status") == "valid" for contact in contacts)

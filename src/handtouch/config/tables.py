@@ -460,6 +460,11 @@ class Pad(Table):
         return tuple(tuple(map(names.index, state)) for state in self.switch_states or ())
 
     @property
+    def state_count(self) -> int:
+        """Number of states of `switch_states`; 1 without."""
+        return len(self.switch_states or (0,))
+
+    @property
     def gaps_mm(self) -> tuple[tuple[float, float], ...]:
         """Bare lengths [mm] at the low and the high end of each electrode: (n, 2)."""
         return tuple((self.gap_mm + low, self.gap_mm + high) for low, high in self.gap_offsets_mm)

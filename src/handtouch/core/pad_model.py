@@ -36,6 +36,7 @@ from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import (
     PadGeometry,
     mount_transform,
+    network_parameters,
     pad_network,
     pad_surface,
 )
@@ -121,7 +122,7 @@ class PadModel:
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
         self._nominal_a = self.ampere_per_count.copy()
         self.gains = self._used.astype(np.float64)
-        self.state_counts = np.array([len(pad.switch_states or (0,)) for pad in pads])
+        self.state_counts = np.array([pad.state_count for pad in pads])
         self._stated_gain_covariance = np.stack(
             [
                 node.gain_std**2 * _shared_channels(pad, self.channels)
@@ -473,12 +474,11 @@ def _behaviour_of_sheet(sheet: config.Sheet, name: str) -> SheetBehaviour | None
 
 
 def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
-    """Return the current per count of the electrodes."""
+    """Return the current per count of the electrodes; the sum of all is the mean of those of the states."""
     node = deployment.nodes[pad.node]
     scale = [node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names]
-    states = len(pad.switch_states or (0,))  # the sum of all currents is the mean of those of the states
     return [
-        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor / states
+        node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor / pad.state_count
         for channel, factor in zip(order_by_electrode(channels, pad), scale, strict=True)
     ]
 
@@ -503,10 +503,7 @@ def networks_of(deployment: Deployment) -> list[RectangleNetwork]:
     networks = []
     for _, pad in deployment.pads:
         sheet = deployment.sheets[pad.sheet]
-        parameters = (
-            *(pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, sheet.ohm_per_square),
-            pad.state_numbers,
-        )
+        parameters = network_parameters(pad), sheet.ohm_per_square
         if parameters not in shared:
             shared[parameters] = pad_network(pad, sheet)
         networks.append(shared[parameters])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.config.channels import channel_states
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
@@ -64,20 +65,12 @@ def stage_tolerances(
         view_memory(radius_m * overhangs(sheet.contact_elongation_std)),
         radius_m * OVERHANG_STEP,
         is_elongated,
-        max(1, len(pad.state_numbers)),
-        view_memory(_states_of_electrodes(pad)),
+        pad.state_count,
+        view_memory(np.array(channel_states(pad) or [0] * len(pad.electrode_names), dtype=np.intp)),
         _STATE_STD if pad.switch_states else 0.0,
         _state_ohm_std(network) / node.drive_v,
         not (end_vectors.any() or aspect_std or sheet.unevenness_std or has_series or is_elongated),
     )
-
-
-def _states_of_electrodes(pad: config.Pad) -> NDArray[np.intp]:
-    """Return the number of the state that each electrode (n,) is connected in; 0 where none is switched."""
-    states = np.zeros(len(pad.electrode_names), dtype=np.intp)
-    for number, electrodes in enumerate(pad.state_numbers):
-        states[list(electrodes)] = number
-    return states
 
 
 def _state_ohm_std(network: RectangleNetwork) -> float:

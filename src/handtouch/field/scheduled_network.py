@@ -96,14 +96,10 @@ class ScheduledNetwork(RectangleNetwork):
         """Return the fractions that directly grounded electrodes would collect, all at once: (m, ...)."""
         return self.network.ideal_fractions(x, y)
 
-    def fractions(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return the fractions of the schedule (m, ...), those of each state summing to 1 / states."""
-        return np.asarray(np.tensordot(self._mix, self.ideal_fractions(x, y), axes=1))
-
     def fractions_with_jacobian(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return `fractions` (m, ...) and derivatives by (x, y) (m, 2, ...)."""
         ideal, jacobian = self._bare.fractions_with_jacobian(x, y)
-        return np.tensordot(self._mix, ideal, axes=1), np.tensordot(self._mix, jacobian, axes=1)
+        return self._mixed(ideal), self._mixed(jacobian)
 
     def state_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return the resistance [ohm] from a contact to ground that each state adds to that of the electrodes
@@ -135,7 +131,5 @@ class ScheduledNetwork(RectangleNetwork):
             found[:, state] = one.series_sensitivity[:, state]
         return found
 
-    @property
-    def currents_per_ideal(self) -> FloatArray:
-        """Matrix (m, m) from the fractions of directly grounded electrodes to those of the schedule."""
-        return self._mix
+    def _mixed(self, ideal: FloatArray) -> FloatArray:
+        return np.asarray(np.tensordot(self._mix, ideal, axes=1))

@@ -1,7 +1,7 @@
 """Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `pad_network`, `models_with_other_parts`,
-`part_stds`, `PadGeometry`, `LinkContacts`.
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_network`,
+`models_with_other_parts`, `part_stds`, `PadGeometry`, `LinkContacts`.
 """
 
 from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
@@ -9,6 +9,7 @@ from handtouch.hand.pads import (
     electrode_network,
     models_with_other_parts,
     mount_transform,
+    network_parameters,
     pad_network,
     pad_surface,
     part_stds,
@@ -20,6 +21,7 @@ __all__ = [
     "electrode_network",
     "models_with_other_parts",
     "mount_transform",
+    "network_parameters",
     "pad_network",
     "pad_surface",
     "part_stds",

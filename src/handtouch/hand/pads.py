@@ -1,8 +1,8 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
-Public names: `pad_surface`, `mount_transform`, `pad_network`, `electrode_network`, `models_with_other_parts`,
-`part_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`,
-`MountUncertainty`.
+Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_network`, `electrode_network`,
+`models_with_other_parts`, `part_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`,
+`rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -54,6 +54,11 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
     pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     return np.asarray(yaw @ pitch @ roll)
+
+
+def network_parameters(pad: config.Pad) -> tuple[object, ...]:
+    """Return what `pad_network` depends on, but for the sheet: pads with the same share a network."""
+    return pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
 
 
 def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:

@@ -32,7 +32,7 @@ from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.field.model import FractionModel
 from handtouch.field.rectangle_network import RectangleNetwork
-from handtouch.hand import models_with_other_parts, pad_network, part_stds
+from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_stds
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
     MAX_TEXT,
@@ -88,7 +88,7 @@ class _PadEntry:
     calibrator: AutoCalibrator
     contact_detector: StationaryContactDetector
     channels: int
-    is_switched: bool = False
+    is_switched: bool
     """its electrodes share channels by a schedule: their gains aren't independent, and aren't learned"""
     version_number: int = 0
     """number of the newest stored version of the node, 0 for none"""
@@ -118,13 +118,7 @@ class SupervisorWorker:
         self._pads = []
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):
-            design, sheet = (
-                (
-                    *(pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.sheet, pad.node),
-                    pad.state_numbers,
-                ),
-                deployment.sheets[pad.sheet],
-            )
+            design, sheet = (network_parameters(pad), pad.sheet, pad.node), deployment.sheets[pad.sheet]
             if design not in models:
                 network, node = pad_network(pad, sheet), deployment.nodes[pad.node]
                 others = models_with_other_parts(network, pad, node, sheet)
@@ -132,8 +126,10 @@ class SupervisorWorker:
             mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
             channels = len(pad.electrode_names)
             detector = StationaryContactDetector(noise[number, :channels])
-            self._pads.append(_PadEntry(mounting_point, AutoCalibrator(*models[design]), detector, channels))
-            self._pads[-1].is_switched = bool(pad.switch_states)
+            calibrator = AutoCalibrator(*models[design])
+            self._pads.append(
+                _PadEntry(mounting_point, calibrator, detector, channels, bool(pad.switch_states))
+            )
         self._ampere_per_count = start.ampere_per_count
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])

@@ -50,10 +50,10 @@ _REMOTE_FLAG, _ERROR_FLAG, _IDENTIFIER_MASK = 0x40000000, 0x20000000, 0x1FFFFFFF
 class _SocketReceiver:
     """A bus whose socket is read in the caller's thread, behind an epoll with a constant descriptor."""
 
-    def __init__(self, opener: Opener) -> None:
+    def __init__(self, opener: Opener, reader: FrameReader) -> None:
         self.fault: BusFault | None = None
         self.backlog_ns: int | None = None
-        self._opener = opener
+        self._opener, self._reader = opener, reader
         self._epoll: select.epoll | None = None
         self._backoff = ReopenBackoff()
         self._consecutive_errors = 0
@@ -114,7 +114,25 @@ class _SocketReceiver:
         return None
 
     def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:
-        raise NotImplementedError
+        reader, descriptor = self._reader, self._socket.fileno()
+        offset_ns, read = clock_offset_ns(), 0
+        while bus is self._bus:  # a failure may close it
+            before_ns = time.monotonic_ns()
+            count = reader.receive(descriptor, offset_ns, self._emptied_ns)
+            self._accept_batch(router, count, others)
+            if count:
+                self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
+            if count < BATCH_FRAMES:
+                self._emptied_ns = before_ns
+                return
+            read += count
+            if read >= MAX_DRAIN_FRAMES:
+                self.backlog_ns = self._newest_ns
+                return
+
+    def _accept_batch(self, router: Router, count: int, others: list[CanFrame]) -> None:
+        """Accept the first frames of the reader's batch."""
+        _accept_frames(self._reader, router, 0, count, others)
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:
         bus.send(make_message(can_id, data, remote))
@@ -175,31 +193,13 @@ class SocketcanReceiver(_SocketReceiver):
 
     def __init__(self, opener: Opener, channel: str) -> None:
         self._channel = channel
-        self._reader = FrameReader()
-        super().__init__(opener)
+        super().__init__(opener, FrameReader())
 
     def _reopen(self, router: Router) -> can.BusABC | None:
         # To open an unknown name, the kernel searches for a module to load, which takes milliseconds.
         if all(name != self._channel for _, name in socket.if_nameindex()):
             return None
         return super()._reopen(router)
-
-    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:  # noqa: ARG002
-        reader, descriptor = self._reader, self._socket.fileno()
-        offset_ns, read = clock_offset_ns(), 0
-        while True:
-            before_ns = time.monotonic_ns()
-            count = reader.receive(descriptor, offset_ns, self._emptied_ns)
-            _accept_batch(reader, router, 0, count, others)
-            if count:
-                self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
-            if count < BATCH_FRAMES:
-                self._emptied_ns = before_ns
-                return
-            read += count
-            if read >= MAX_DRAIN_FRAMES:
-                self.backlog_ns = self._newest_ns
-                return
 
     def _attach_bus(self, bus: can.BusABC) -> None:
         super()._attach_bus(bus)
@@ -216,7 +216,7 @@ class SocketcanReceiver(_SocketReceiver):
         return _KernelSender(self._bus.send_periodic(make_message(can_id, data), period_s, store_task=False))
 
 
-def _accept_batch(reader: FrameReader, router: Router, first: int, end: int, others: list[CanFrame]) -> None:
+def _accept_frames(reader: FrameReader, router: Router, first: int, end: int, others: list[CanFrame]) -> None:
     """Pass frames `first` to `end` of a batch to the router."""
     first = router.accept_samples(reader.batch, first, end)
     while first < end:
@@ -260,31 +260,17 @@ class DatagramReceiver(_SocketReceiver):
     frame."""
 
     def __init__(self, opener: Opener) -> None:
-        self._reader = PacketReader()
-        super().__init__(opener)
+        self._packets = PacketReader()
+        super().__init__(opener, self._packets)
 
-    def _receive(self, bus: can.BusABC, router: Router, others: list[CanFrame]) -> None:
-        reader, descriptor = self._reader, self._socket.fileno()
-        offset_ns, read = clock_offset_ns(), 0
-        while bus is self._bus:
-            before_ns = time.monotonic_ns()
-            count = reader.receive(descriptor, offset_ns, self._emptied_ns)
-            first = 0
-            while first < count:
-                end = reader.unpack(first, count)
-                _accept_batch(reader, router, first, end, others)
-                if end < count:
-                    self._accept_packet(router, *reader.packet(end), others)
-                first = end + 1
-            if count:
-                self._newest_ns = frame_arrival_ns(reader.batch, count - 1)
-            if count < BATCH_FRAMES:
-                self._emptied_ns = before_ns
-                return
-            read += count
-            if read >= MAX_DRAIN_FRAMES:
-                self.backlog_ns = self._newest_ns
-                return
+    def _accept_batch(self, router: Router, count: int, others: list[CanFrame]) -> None:
+        first = 0
+        while first < count:
+            end = self._packets.unpack(first, count)
+            _accept_frames(self._packets, router, first, end, others)
+            if end < count:
+                self._accept_packet(router, *self._packets.packet(end), others)
+            first = end + 1
 
     def _accept_packet(self, router: Router, packet: bytes, arrival_ns: int, others: list[CanFrame]) -> None:
         """Accept a packet that isn't packed as plain data frames are; count what python-can can't unpack."""
