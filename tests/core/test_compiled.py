@@ -84,6 +84,16 @@ print(*(f'{stage}-{source_hash(stage)}' for stage in STAGES))"
 
 
 @needs_compiled
+def test_files_of_other_sources_are_removed_even_if_nothing_is_to_compile(copied: Path) -> None:
+    folder = copied / "handtouch/core/stages/_compiled"
+    files = set(folder.iterdir())
+    (folder / "solve-0123456789abcdef-linux_x86_64.abi3.so").touch()
+    done = run("-m", "handtouch.core.build", source=copied)
+    assert done.returncode == 0, done.stderr
+    assert set(folder.iterdir()) == files
+
+
+@needs_compiled
 def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied: Path) -> None:
     folder = copied / "handtouch/core/stages/_compiled"
     files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}

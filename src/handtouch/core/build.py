@@ -40,6 +40,8 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     files = [compiled.compiled_file(name, f"linux_{machine}" if machine else "") for name in compiled.STAGES]
     if machine:
         files = [source.parent / "build" / machine / file.name for file in files]
+    for old in set(files[0].parent.glob("*.so")) - set(files):
+        old.unlink()
     missing = [(name, file) for name, file in zip(compiled.STAGES, files, strict=True) if not file.exists()]
     if not missing:
         return files
@@ -66,8 +68,6 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     compile_stage(missing[0])  # by itself: what fails here would fail for all
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         list(pool.map(compile_stage, missing[1:]))
-    for old in set(files[0].parent.glob("*.so")) - set(files):
-        old.unlink()
     return files
 
 
