@@ -127,13 +127,15 @@ def test_centroid_shift_by_pressing_harder_is_not_slip() -> None:
     assert alarms(Contacts(pads), moved, force, rng) == []
 
 
-def test_chatter_that_returns_is_not_slip() -> None:
+@pytest.mark.parametrize("amplitude_m", [0.1e-3, 0.2e-3])
+def test_chatter_that_returns_is_not_slip(amplitude_m: float) -> None:
+    """A saturated sheet shows it larger than it is: farther than a slip has to move."""
     rng, pads, steps = np.random.default_rng(11), 12, 1600
     place = wandering(pads, steps, rng, GripModel())
     since_s = np.arange(steps)[:, None] * DT_S - 1.0 - rng.uniform(0.0, 1.4, pads)
     burst = np.where((since_s > 0) & (since_s % 2.0 < 0.6), np.sin(2 * np.pi * 9 * (since_s % 2.0)), 0.0)
     angle = rng.uniform(0, 2 * np.pi, pads)
-    place += 0.1e-3 * burst[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    place += amplitude_m * burst[:, :, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     assert alarms(Contacts(pads), place, np.full((steps, pads), FORCE_N), rng) == []
 
 

@@ -49,6 +49,8 @@ class GripModel:
     """displacement that bursts of chatter don't reach, as it returns"""
     chatter_speed_m_per_s: float = 8e-3
     """speed that they don't reach"""
+    chatter_time_s: float = 0.12
+    """time in which they return"""
     sway_m: float = 80e-6
     """displacement that counts at higher speeds"""
 
@@ -71,6 +73,7 @@ class GripModel:
             "coupling_drift_variance": (self.coupling_std_m * self.coupling_drift_per_s) ** 2,
             "chatter_m": self.chatter_m,
             "chatter_speed": self.chatter_speed_m_per_s,
+            "chatter_time_s": self.chatter_time_s,
             "sway_m": self.sway_m,
         }
         return np.array([named[name] for name in SLIP_PARAMETERS])

@@ -3,7 +3,7 @@ from libc cimport math
 
 cdef Py_ssize_t _PERIOD, _LOG_THRESHOLD, _STRIDE, _CREEP_START, _LEVEL_DRIFT, _TREMOR_START, _TREMOR_MIN
 cdef Py_ssize_t _TREMOR_MAX, _TREMOR_RATE, _TREMOR_TIME, _CREEP_TIME, _COUPLING, _COUPLING_DRIFT
-cdef Py_ssize_t _CHATTER, _CHATTER_SPEED, _SWAY, _START, _LAST
+cdef Py_ssize_t _CHATTER, _CHATTER_SPEED, _CHATTER_TIME, _SWAY, _START, _LAST
 cdef Py_ssize_t _ONSETS, _RECENT, _OLDER_STRIDE, _RAMP, _SCORE, _INFORMATION
 cdef Py_ssize_t _LABEL, _LOG_ODDS, _SLIPPING, _SLIPS, _SAMPLES, _AGE
 cdef Py_ssize_t _POSITION, _VELOCITY, _VAR_PP, _VAR_PV, _VAR_VV
@@ -56,7 +56,7 @@ cdef void _learn_creep(SlipStage stage, Py_ssize_t row, Py_ssize_t axis) noexcep
 @cython.locals(s='double[::1]', work='double[::1]', k=Py_ssize_t, best=Py_ssize_t, axis=Py_ssize_t,
                ramps=Py_ssize_t, slow=Py_ssize_t, medium=Py_ssize_t, fast=Py_ssize_t)
 cdef void _sum_ratios(SlipStage stage, Py_ssize_t row) noexcept
-@cython.locals(s='double[::1]', p='double[::1]', x=Py_ssize_t, y=Py_ssize_t, moved=double)
+@cython.locals(s='double[::1]', p='double[::1]', age=double, limit=double, j=Py_ssize_t, x=double, y=double)
 cdef bint _is_slip(SlipStage stage, Py_ssize_t row, Py_ssize_t k) noexcept
 cdef double _log_ratio(double[::1] work, Py_ssize_t k, double speed_variance) noexcept
 @cython.locals(s='double[::1]', axis=Py_ssize_t, k=Py_ssize_t)

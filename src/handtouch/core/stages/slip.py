@@ -16,7 +16,8 @@ against one of random speed, whose variance is learnt for every onset age from w
 while the contact stuck, starting at a prior: gradient ascent on the likelihood.
 
 Chatter moves a contact as fast as a slow slip, and returns. Only onsets count since which the contact moved
-farther than chatter does, or farther than at its speed.
+farther than chatter does, or farther than at its speed, and moved so from all its positions in the period of
+chatter before that onset.
 
 Public names: `SlipStage`, `SLIP_SLICES`, `SLIP_COUNT`, `SLIP_PARAMETERS`, `MOTION_CLASSES`.
 """
@@ -31,12 +32,12 @@ SLIP_PARAMETERS = (
     "period_s", "log_threshold", "onset_stride", "log_creep_variance", "level_drift_variance",
     "log_tremor_variance", "min_log_tremor_variance", "max_log_tremor_variance", "tremor_rate",
     "tremor_time_constant_s", "creep_time_constant_s", "coupling_variance", "coupling_drift_variance",
-    "chatter_m", "chatter_speed", "sway_m",
+    "chatter_m", "chatter_speed", "chatter_time_s", "sway_m",
 )  # fmt: skip
 """Names of the parameters, in order; `handtouch.core.slip.GripModel` explains them."""
 _PERIOD, _LOG_THRESHOLD, _STRIDE, _CREEP_START, _LEVEL_DRIFT, _TREMOR_START, _TREMOR_MIN = 0, 1, 2, 3, 4, 5, 6
 _TREMOR_MAX, _TREMOR_RATE, _TREMOR_TIME, _CREEP_TIME, _COUPLING, _COUPLING_DRIFT = 7, 8, 9, 10, 11, 12
-_CHATTER, _CHATTER_SPEED, _SWAY = 13, 14, 15
+_CHATTER, _CHATTER_SPEED, _CHATTER_TIME, _SWAY = 13, 14, 15, 16
 
 _ONSETS, _RECENT, _OLDER_STRIDE = (
     33,
@@ -445,11 +446,18 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
 
 
 def _is_slip(stage: SlipStage, row: int, k: int) -> bool:
-    """Return whether the displacement since onset k is more than that of chatter, which returns."""
-    s, p = stage.state, stage.parameters
-    x, y = row + _RAMPS + _START + k, row + _RAMPS + _RAMP + _START + k
-    moved = math.sqrt((stage.x - s[x]) * (stage.x - s[x]) + (stage.y - s[y]) * (stage.y - s[y]))
-    return moved > min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * s[row + _AGES + k])
+    """Return whether the displacement since onset k is more than that of chatter, which returns: also from
+    every position that older onsets tell of the time in which chatter returns, before onset k."""
+    s, p, age = stage.state, stage.parameters, stage.state[row + _AGES + k]
+    limit = min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * age)
+    for j in range(k, _ONSETS):
+        if s[row + _AGES + j] == 0.0 or s[row + _AGES + j] > age + p[_CHATTER_TIME]:
+            return True
+        x = stage.x - s[row + _RAMPS + _START + j]
+        y = stage.y - s[row + _RAMPS + _RAMP + _START + j]
+        if x * x + y * y <= limit * limit:
+            return False
+    return True
 
 
 def _log_ratio(work: memoryview[float], k: int, speed_variance: float) -> float:
