@@ -259,17 +259,18 @@ class DatagramReceiver(_SocketReceiver):
     """Receiver for udp_multicast, in batches; python-can's `recv` calls select and checks every key for each
     frame."""
 
+    _reader: PacketReader
+
     def __init__(self, opener: Opener) -> None:
-        self._packets = PacketReader()
-        super().__init__(opener, self._packets)
+        super().__init__(opener, PacketReader())
 
     def _accept_batch(self, router: Router, count: int, others: list[CanFrame]) -> None:
         first = 0
         while first < count:
-            end = self._packets.unpack(first, count)
-            _accept_frames(self._packets, router, first, end, others)
+            end = self._reader.unpack(first, count)
+            _accept_frames(self._reader, router, first, end, others)
             if end < count:
-                self._accept_packet(router, *self._packets.packet(end), others)
+                self._accept_packet(router, *self._reader.packet(end), others)
             first = end + 1
 
     def _accept_packet(self, router: Router, packet: bytes, arrival_ns: int, others: list[CanFrame]) -> None:
