@@ -104,20 +104,21 @@ class ChannelFaultDetector:
         self._repeats_since_ns = np.where(begins, t_ns, self._repeats_since_ns)
         self._repeats = np.where(features.varied, 0, self._repeats) + features.trailing_repeats
         at_end = features.railed_fraction >= 1.0
-        lowest = features.mean_counts.min(axis=0)
-        railed = at_end | (lowest > _MIN_SHORT_FRACTION * self._short_counts)
+        lowest_counts = features.mean_counts.min(axis=0)
+        railed = at_end | (lowest_counts > _MIN_SHORT_FRACTION * self._short_counts)
         self._railed_since_ns = np.where(
             railed, np.where(self._railed_since_ns < 0, t_ns, self._railed_since_ns), -1
         )
-        least = lowest[:, None, :]
         aged = (t_ns // _MIN_WINDOW_NS) != (self._last_ns // _MIN_WINDOW_NS)  # (n, 1)
         recent = np.where(aged[:, :, None], self._recent_min_counts, self._min_counts)
         self._recent_min_counts = np.where(
             railed[:, :, None],
-            np.minimum(np.where(aged[:, :, None], np.inf, self._recent_min_counts), least),
+            np.minimum(
+                np.where(aged[:, :, None], np.inf, self._recent_min_counts), lowest_counts[:, None, :]
+            ),
             np.inf,
         )
-        self._min_counts = np.where(railed[:, :, None], np.minimum(recent, least), np.inf)
+        self._min_counts = np.where(railed[:, :, None], np.minimum(recent, lowest_counts[:, None, :]), np.inf)
         self._last_ns = t_ns
         stuck = self._used & (self._repeats >= self._max_repeats[:, None])
         for pad, channel in np.argwhere(railed | stuck).tolist():
@@ -163,11 +164,11 @@ class ChannelFaultDetector:
         healthy = ~self.faulty_channels[pad, own] & (self._railed_since_ns[pad, own] < 0)
         healthy[channel] = False
         others = features.mean_counts[:, pad, own][:, healthy]
-        least = self._min_counts[pad, channel, own][healthy]
+        lowest_counts = self._min_counts[pad, channel, own][healthy]
         evidence = {"count": float(count), "others_counts": float(others.sum(axis=1).min())}
-        if count > 0 and self._is_short(pad, channel, healthy, least, lasted):
+        if count > 0 and self._is_short(pad, channel, healthy, lowest_counts, lasted):
             return ChannelFault(FaultKind.SHORTED_ELECTRODE, since, evidence)
-        untouched = np.abs(least).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
+        untouched = np.abs(lowest_counts).sum() < _MAX_UNTOUCHED_FRACTION * abs(count)
         if untouched or count < 0:
             return ChannelFault(FaultKind.SATURATED_CHANNEL, since, evidence)
         if lasted > _MIN_RAILED_TOUCHED_NS:  # a contact all the time, or a short of an unusual sheet
@@ -175,34 +176,34 @@ class ChannelFaultDetector:
         return None
 
     def _is_short(
-        self, pad: int, channel: int, healthy: NDArray[np.bool_], least: FloatArray, lasted_ns: int
+        self, pad: int, channel: int, healthy: NDArray[np.bool_], lowest_counts: FloatArray, lasted_ns: int
     ) -> bool:
         """Return whether the lowest counts of healthy channels (c,) are those of a short of `channel`.
 
         Also of a pad with one dead electrode: its channel is silent, the others carry its part; after a time
         that contacts don't last, as one on a long pad may leave a far channel silent.
         """
-        silent = np.abs(least) < _MAX_SILENT_SIGMA * self._model.reading_noise_counts[pad]
+        silent = np.abs(lowest_counts) < _MAX_SILENT_SIGMA * self._model.reading_noise_counts[pad]
         silent &= lasted_ns > _MIN_RAILED_TOUCHED_NS
-        if len(least) - silent.sum() < _MIN_CHANNELS_OF_SHORT or silent.sum() > 1:
+        if len(lowest_counts) - silent.sum() < _MIN_CHANNELS_OF_SHORT or silent.sum() > 1:
             return False
         expected = self._idle_counts[pad][channel]
         if silent.any():
             expected = _idle_counts(self._model, pad, int(np.flatnonzero(healthy)[silent][0]))[channel]
-        return _matches_short(least[~silent], expected[healthy][~silent])
+        return _matches_short(lowest_counts[~silent], expected[healthy][~silent])
 
 
-def _matches_short(least: FloatArray, expected: FloatArray) -> bool:
+def _matches_short(lowest_counts: FloatArray, expected: FloatArray) -> bool:
     """Return whether the lowest counts (k,) of the other channels are those of a short to the layer.
 
     No contact drives them so: next to an electrode, that takes most of its current.
     """
-    ratio = float(least.sum() / expected.sum())
+    ratio = float(lowest_counts.sum() / expected.sum())
     if not _IDLE_RATIO_RANGE[0] < ratio < _IDLE_RATIO_RANGE[1]:
         return False
     share = ratio * expected
     allowed = _MAX_IDLE_DEVIATION * share + _MAX_IDLE_DEVIATION_OF_SUM * share.sum()
-    return bool((np.abs(least - share) < allowed).all())
+    return bool((np.abs(lowest_counts - share) < allowed).all())
 
 
 def _repeat_probability(std: FloatArray) -> FloatArray:
