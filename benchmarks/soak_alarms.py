@@ -16,7 +16,6 @@ from page import made_by, options, output_folder, progress, table
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
 import platform
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -217,20 +216,16 @@ def play(task: tuple[str, int]) -> dict[str, Any]:
     hour, alarms = Hour(WORLDS[world], seed), []
     model = DiagnosisModel.from_deployment(hour.deployment, "right")
     diagnosis = HandDiagnostics(model, tables=_TABLES)
-    began, diagnosing = time.process_time(), 0.0
     for block in hour.blocks():
-        before = time.process_time()
         for f in diagnosis.process_block(block):
             if f.is_fault and f.until_ns is None:
                 values = {key: float(value) for key, value in f.values.items()}
                 alarms.append(
                     {"kind": f.kind.value, "link": f.link, "t_s": f.published.since_ns * 1e-9, **values}
                 )
-        diagnosing += time.process_time() - before
     return {
         "world": world, "seed": seed, "alarms": alarms, "bouts": dict(hour.bouts),
         "touches": len(hour.touches), "busy_s": sum(end - begin for begin, end in hour.busy),
-        "cpu_s": time.process_time() - began, "diagnosing_s": diagnosing,
     }  # fmt: skip
 
 
@@ -272,8 +267,7 @@ def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [
         {"touches": sum(r["touches"] for r in results),
          "in use, %": sum(r["busy_s"] for r in results) / hours / 36,
-         **{f"bouts: {name}": count for name, count in bouts.most_common()},
-         "diagnosis, % of a core": sum(r["diagnosing_s"] for r in results) / hours / 36}
+         **{f"bouts: {name}": count for name, count in bouts.most_common()}}
     ]  # fmt: skip
 
 
