@@ -24,7 +24,7 @@ cdef class SlipStage:
     cdef unsigned int[::1] contact_id, ids
     cdef Py_ssize_t[::1] sample_ns, times
     cdef double x, y, noise_x, noise_y, press, dt_s
-    cdef double f11, f12, f21, f22, q11, q12, q22, innovation, variance, gain0, gain1, gain2, gain3
+    cdef double f11, f12, f21, f22, q11, q12, q22, innovation, variance, gain0, gain1, gain2, gain3, alarm_ratio
     @cython.locals(k=Py_ssize_t)
     cpdef detect_slips(self, Py_ssize_t[::1] pads)
 
@@ -56,8 +56,10 @@ cdef void _learn_creep(SlipStage stage, Py_ssize_t row, Py_ssize_t axis) noexcep
 @cython.locals(s='double[::1]', work='double[::1]', k=Py_ssize_t, best=Py_ssize_t, axis=Py_ssize_t,
                ramps=Py_ssize_t, slow=Py_ssize_t, medium=Py_ssize_t, fast=Py_ssize_t)
 cdef void _sum_ratios(SlipStage stage, Py_ssize_t row) noexcept
-@cython.locals(s='double[::1]', p='double[::1]', age=double, limit=double, j=Py_ssize_t, x=double, y=double)
-cdef bint _is_slip(SlipStage stage, Py_ssize_t row, Py_ssize_t k) noexcept
+@cython.locals(s='double[::1]', p='double[::1]', limit=double, x=double, y=double)
+cdef bint _is_far(SlipStage stage, Py_ssize_t row, Py_ssize_t k, Py_ssize_t j) noexcept
+@cython.locals(ages=Py_ssize_t, since_s=double, j=Py_ssize_t)
+cdef bint _has_left(SlipStage stage, Py_ssize_t row, Py_ssize_t k) noexcept
 cdef double _log_ratio(double[::1] work, Py_ssize_t k, double speed_variance) noexcept
 @cython.locals(s='double[::1]', axis=Py_ssize_t, k=Py_ssize_t)
 cdef void _start_slip(SlipStage stage, Py_ssize_t row) noexcept

@@ -16,8 +16,9 @@ against one of random speed, whose variance is learnt for every onset age from w
 while the contact stuck, starting at a prior: gradient ascent on the likelihood.
 
 Chatter moves a contact as fast as a slow slip, and returns. Only onsets count since which the contact moved
-farther than chatter does, or farther than at its speed, and moved so from all its positions in the period of
-chatter before that onset.
+farther than chatter does, or farther than at its speed. For alarms and odds, it must also be as far from all
+its positions in the period of chatter before that onset; ln R itself, evidence beside that of joints, counts
+the others too.
 
 Public names: `SlipStage`, `SLIP_SLICES`, `SLIP_COUNT`, `SLIP_PARAMETERS`, `MOTION_CLASSES`.
 """
@@ -147,6 +148,7 @@ class SlipStage:
         self.f11 = self.f12 = self.f21 = self.f22 = 0.0  # tremor and its speed over dt
         self.q11 = self.q12 = self.q22 = 0.0  # what they gain, relative to the tremor's variance
         self.innovation = self.variance = 0.0
+        self.alarm_ratio = _NO_SLIP  # ln R of onsets that chatter can't explain
         self.gain0 = self.gain1 = self.gain2 = self.gain3 = 0.0
 
     def detect_slips(self, pads: memoryview[int]) -> None:
@@ -162,7 +164,7 @@ def process_sample(stage: SlipStage, pad: int) -> None:
     usable = -_INFINITY < stage.x + stage.y + stage.noise_x + stage.noise_y + stage.press < _INFINITY
     force = stage.values[values + _FORCE_N]
     known = -_INFINITY < force < _INFINITY
-    stage.dt_s = 0.0
+    stage.dt_s, stage.alarm_ratio = 0.0, _NO_SLIP
     if stage.contact_id[pad] != stage.ids[pad]:
         if not usable:
             return
@@ -178,7 +180,7 @@ def process_sample(stage: SlipStage, pad: int) -> None:
         state[row + _AGE] += stage.dt_s
         _track_motion(stage, row, force if known else state[row + _FORCE])
         _test_slip(stage, row)
-        if state[row + _LOG_RATIO] > stage.parameters[_LOG_THRESHOLD] and state[row + _SLIPPING] == 0.0:
+        if stage.alarm_ratio > stage.parameters[_LOG_THRESHOLD] and state[row + _SLIPPING] == 0.0:
             _start_slip(stage, row)
         if state[row + _SLIPPING] != 0.0:
             _detect_rest(stage, row)
@@ -244,7 +246,7 @@ def _start_test(stage: SlipStage, row: int, kept: bool) -> None:
     s[row + _FIRST_PRESS] = s[row + _LAST_PRESS] = s[row + _BEFORE_PRESS] = stage.press
     s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
     s[row + _TESTED] = s[row + _UNTIL_ONSET] = s[row + _ONSET_NUMBER] = s[row + _ONSET_AGE] = 0.0
-    s[row + _LOG_RATIO] = _NO_SLIP
+    s[row + _LOG_RATIO] = stage.alarm_ratio = _NO_SLIP
 
 
 def _track_motion(stage: SlipStage, row: int, force: float) -> None:
@@ -417,7 +419,8 @@ def _learn_creep(stage: SlipStage, row: int, axis: int) -> None:
 
 
 def _sum_ratios(stage: SlipStage, row: int) -> None:
-    """Compute ln R from the onsets' likelihood ratios, each weighted by the samples it stands for."""
+    """Compute ln R from the onsets' likelihood ratios, each weighted by the samples it stands for; and that
+    of the onsets that chatter can't explain by its return."""
     s, work = stage.state, stage.work
     most = _NO_SLIP
     for k in range(_ONSETS):
@@ -427,17 +430,20 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
             work[medium] = _log_ratio(work, k, _MEDIUM)
             work[fast] = _log_ratio(work, k, _FAST)
             most = max(most, work[slow], work[medium], work[fast])
-    total, best, largest = 0.0, 0, -1.0
+    total, left, best, largest = 0.0, 0.0, 0, -1.0
     for k in range(_ONSETS):
-        if s[row + _AGES + k] > 0.0 and _is_slip(stage, row, k):
+        if s[row + _AGES + k] > 0.0 and _is_far(stage, row, k, k):
             share = math.exp(work[4 * _ONSETS + k] - most)
             share += math.exp(work[5 * _ONSETS + k] - most)
             share += math.exp(work[6 * _ONSETS + k] - most)
             share *= (1.0 if k < _RECENT else 1.0 * _OLDER_STRIDE) / 3.0
             total += share
+            if _has_left(stage, row, k):
+                left += share
             if share > largest:
                 largest, best = share, k
     s[row + _LOG_RATIO] = most + math.log(max(total, 1e-300) * stage.parameters[_STRIDE])
+    stage.alarm_ratio = most + math.log(max(left, 1e-300) * stage.parameters[_STRIDE])
     if s[row + _LOG_RATIO] > _MIN_ONSET_LOG_ODDS:
         s[row + _ONSET_AGE] = s[row + _AGES + best]
         for axis in range(2):
@@ -445,17 +451,23 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
             s[row + _SLIP_VELOCITY + axis] = s[ramps + _SCORE] / max(s[ramps + _INFORMATION], 1e-12)
 
 
-def _is_slip(stage: SlipStage, row: int, k: int) -> bool:
-    """Return whether the displacement since onset k is more than that of chatter, which returns: also from
-    every position that older onsets tell of the time in which chatter returns, before onset k."""
-    s, p, age = stage.state, stage.parameters, stage.state[row + _AGES + k]
-    limit = min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * age)
-    for j in range(k, _ONSETS):
-        if s[row + _AGES + j] == 0.0 or s[row + _AGES + j] > age + p[_CHATTER_TIME]:
+def _is_far(stage: SlipStage, row: int, k: int, j: int) -> bool:
+    """Return whether the contact is farther from its position at onset j than chatter moves it since k."""
+    s, p = stage.state, stage.parameters
+    limit = min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * s[row + _AGES + k])
+    x = stage.x - s[row + _RAMPS + _START + j]
+    y = stage.y - s[row + _RAMPS + _RAMP + _START + j]
+    return x * x + y * y > limit * limit
+
+
+def _has_left(stage: SlipStage, row: int, k: int) -> bool:
+    """Return whether the contact is as far from its positions in the time before onset k in which chatter
+    returns, as known from older onsets."""
+    ages, since_s = row + _AGES, stage.state[row + _AGES + k] + stage.parameters[_CHATTER_TIME]
+    for j in range(k + 1, _ONSETS):
+        if stage.state[ages + j] == 0.0 or stage.state[ages + j] > since_s:
             return True
-        x = stage.x - s[row + _RAMPS + _START + j]
-        y = stage.y - s[row + _RAMPS + _RAMP + _START + j]
-        if x * x + y * y <= limit * limit:
+        if not _is_far(stage, row, k, j):
             return False
     return True
 
@@ -503,7 +515,7 @@ def _classify(stage: SlipStage, row: int) -> None:
     falls = max(-s[row + _RATE], 0.0) / max(3.0 * s[row + _RATE_STD], 1e-9)
     hazard = _SLIP_RATE_HZ * (1.0 + (_UNLOADING_FACTOR - 1.0) * min(falls, 1.0)) * stage.parameters[_PERIOD]
     s[row + _LOG_ODDS] = max(
-        s[row + _LOG_RATIO] + math.log(hazard), s[row + _LOG_ODDS] - stage.dt_s / _ODDS_DECAY_S
+        stage.alarm_ratio + math.log(hazard), s[row + _LOG_ODDS] - stage.dt_s / _ODDS_DECAY_S
     )
     label = _SLIDING if s[row + _SLIPPING] != 0.0 else _INCIPIENT if s[row + _LOG_ODDS] > 0.0 else _STICKING
     if s[row + _FORCE] + (_LIFT_OFF_HORIZON_S + _FORCE_RATE_TIME_S) * s[row + _RATE] < 0.0:
