@@ -51,6 +51,7 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
     files[0].parent.mkdir(parents=True, exist_ok=True)
+    cython = [sys.executable, "-c", compiled.CYTHON]
     command = [*compiler, *compiled.FLAGS, *compiled.LIMITED_API, f"-I{include}"]
 
     def compile_stage(stage: tuple[str, Path]) -> None:
@@ -58,7 +59,7 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
         with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=file.parent) as work:
             options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
             source_file = f"handtouch/core/stages/{name}.py"
-            _run([sys.executable, "-m", "cython", *options, "-o", f"{work}/{name}.c", source_file], source)
+            _run([*cython, *options, "-o", f"{work}/{name}.c", source_file], source)
             _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], Path(work))  # its path is in no file
             built = Path(work) / f"{name}.so"
             if machine:

@@ -37,7 +37,13 @@ DIRECTIVES = {
     "annotation_typing": "False",  # types are in the .pxd files
     "binding": "False",
 }
-FLAGS = ("-O2", "-fPIC", "-shared", "-s", "-fno-strict-aliasing", "-ffp-contract=off", "-w")
+CYTHON = (
+    "from Cython.Compiler import Options; Options.buffer_max_dims = 2; "
+    "from Cython.Compiler.Main import main; main(command_line=True)"
+)
+"""Program that translates a stage to C. Memoryviews are passed by value: with room for eight axes, which is
+Cython's default, each is 208 bytes, of which one axis needs 40."""
+FLAGS = ("-O3", "-fno-math-errno", "-fPIC", "-shared", "-s", "-ffp-contract=off", "-w")
 LIMITED_API = ("-DCYTHON_LIMITED_API=1", "-DPy_LIMITED_API=0x030B0000")
 """The stable ABI of Python 3.11: one file for this and all later versions."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
@@ -75,7 +81,7 @@ def source_hash(stage: str) -> str:
         used = {name for found in _CIMPORT.findall(text) for name in re.findall(r"\w+", found[0] or found[1])}
         waiting += used - declarations
         declarations |= used
-    digest = hashlib.sha256(repr((DIRECTIVES, FLAGS, LIMITED_API)).encode())
+    digest = hashlib.sha256(repr((DIRECTIVES, CYTHON, FLAGS, LIMITED_API)).encode())
     digest.update((_FOLDER / f"{stage}.py").read_bytes())
     for name in sorted(declarations):
         digest.update((_FOLDER / f"{name}.pxd").read_bytes())
