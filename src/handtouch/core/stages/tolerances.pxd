@@ -44,6 +44,8 @@ cdef void whiten_pair(
     double total_2, double s_2, double t_2) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void _begin(Whitening whitening) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef void _clear(double[::1] values, Py_ssize_t count) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, matrix='double[::1]')
 cdef void _add_contact(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
@@ -79,7 +81,7 @@ cdef void _add_second_derivatives(
     Whitening whitening, Py_ssize_t states, double[::1] weight, double total, double std) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
-cdef void _add_square(Whitening whitening) noexcept
+@cython.locals(i=Py_ssize_t, j=Py_ssize_t)
+cdef void _add_square(double[::1] matrix, double[::1] vector, Py_ssize_t n) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)
 cdef void _invert_root(double[::1] matrix, Py_ssize_t n) noexcept

@@ -222,8 +222,13 @@ def _begin(whitening: Whitening) -> None:
         for j in range(n):
             whitening.matrix[i * n + j] = 0.0
         whitening.matrix[i * n + i] = 1.0
-    for i in range(part_count(n) * n):
-        whitening.changes[i] = 0.0
+    _clear(whitening.changes, part_count(n) * n)
+
+
+def _clear(values: memoryview[float], count: int) -> None:
+    """Set the first values to 0."""
+    for i in range(count):
+        values[i] = 0.0
 
 
 def _add_contact(
@@ -268,7 +273,7 @@ def _add_states(
             vector[i] = 0.0
             if pad.state_of[i] == state:
                 vector[i] = std * total * fractions[first + i] * weight[i]
-        _add_square(whitening)
+        _add_square(whitening.matrix, vector, n)
 
 
 def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, number: int) -> None:
@@ -287,7 +292,7 @@ def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, n
             if step != 0.0:
                 for i in range(n):
                     vector[i] += step * changes[j * n + i]
-        _add_square(whitening)
+        _add_square(whitening.matrix, vector, n)
     for j in range(varied):
         step = offsets[number * known.parts + j]
         if step != 0.0:
@@ -378,7 +383,7 @@ def _add_second_derivatives(
     for k in range(2):
         for i in range(n):
             vector[i] = std * fields[(2 * states + 1 + _WAVES + k) * n + i] * total * weight[i]
-        _add_square(whitening)
+        _add_square(whitening.matrix, vector, n)
 
 
 def overhang(pad: PadTolerances, distance_m: float) -> float:
@@ -390,12 +395,12 @@ def overhang(pad: PadTolerances, distance_m: float) -> float:
     return pad.overhangs[k] + (place - k) * (pad.overhangs[k + 1] - pad.overhangs[k])
 
 
-def _add_square(whitening: Whitening) -> None:
-    """Add the square of `vector` to the lower triangle."""
-    n = whitening.electrodes
+def _add_square(matrix: memoryview[float], vector: memoryview[float], n: int) -> None:
+    """Add the square of a vector (n,) to the lower triangle of a matrix (n n,)."""
     for i in range(n):
+        factor = vector[i]
         for j in range(i + 1):
-            whitening.matrix[i * n + j] += whitening.vector[i] * whitening.vector[j]
+            matrix[i * n + j] += factor * vector[j]
 
 
 def _invert_root(matrix: memoryview[float], n: int) -> None:
