@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import parse
+from handtouch.core import pad_tables
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field.contact_law import ContactLaw, ForceEstimateStatus
@@ -105,6 +106,23 @@ def solve_drawn(text: str, forces: FloatArray) -> tuple[FloatArray, FloatArray, 
         currents.append(float(law.current(force_n, 5.0, sheet_ohm, spreading_m)) * fractions)
     force, std, status = solve_each(model, np.array(currents)).T
     return force, std, status
+
+
+def test_fewer_nodes_for_nearly_log_normal_forces_give_force_and_deviation_of_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    forces = np.exp(np.random.default_rng(3).uniform(np.log(0.2), np.log(GREATEST_N), 300))
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
+    few = solve_drawn(text, forces)
+    monkeypatch.setattr(pad_tables, "NEAR_FORCE_NODES", 24)
+    pad_tables.stack_table.cache_clear()
+    many = solve_drawn(text, forces)
+    pad_tables.stack_table.cache_clear()
+    valid = many[2] == ForceEstimateStatus.VALID
+    assert valid.mean() > 0.9
+    assert np.array_equal(few[2], many[2])
+    for found, expected in zip(few[:2], many[:2], strict=True):
+        assert 0 < np.abs((found - expected) / many[1])[valid].max() < 0.02
 
 
 HERTZ = "contact_radius_std_mm = 0.5\nhertz_force_n = 2.0"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.memory import view_memory
-from handtouch.core.stages.force import StackTable
+from handtouch.core.stages.force import MAX_SIGMA, StackTable
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.solve import MAX_SQUARED_MISFIT
 from handtouch.core.stages.tables import PadSurface
@@ -53,6 +53,9 @@ _MIN_LOG_X2, _MAX_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1 / 16
 FORCE_NODES = 8
 """Of the quadrature over ln x^2. Beside 80 nodes, on 18,000 contacts of random current, noise and place,
 forces are within 0.015 of their standard deviation, and that within 1 %; with 6 nodes within 0.06 and 5 %"""
+NEAR_FORCE_NODES = 5
+"""The same where the force is nearly log-normal: beside 64 nodes, on 5,585 such contacts of 26,047 of random
+sheet, law, radius, current and place, forces are within 0.01 of their standard deviation, that within 2 %"""
 
 
 def hermite_table(values: FloatArray) -> FloatArray:
@@ -395,8 +398,30 @@ def stack_table() -> StackTable:
     factor = stack_factor(np.exp(log_x2 / 2))
     by_log_x2 = (1 - np.exp(log_x2) * np.square(factor)) / 2
     points, weights = np.polynomial.legendre.leggauss(FORCE_NODES)
+    near_points, near_weights = _normal_quadrature(NEAR_FORCE_NODES)
+    rules = np.stack([np.append(points, near_points), np.append(weights, near_weights)], axis=1)
+    rules[:, 0] = (1 + rules[:, 0]) / 2
     return StackTable(
         *(view_memory(np.ascontiguousarray(pieces)), _MIN_LOG_FACTOR, width),
         *(view_memory(np.stack([factor, by_log_x2 * _LOG_X2_WIDTH], axis=1)), _MIN_LOG_X2, _LOG_X2_WIDTH),
-        view_memory(np.stack([(1 + points) / 2, weights], axis=1)),
+        *(view_memory(rules), FORCE_NODES),
     )
+
+
+def _normal_quadrature(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return nodes and weights on -1 to 1 of Gauss's rule for the normal density within MAX_SIGMA deviations.
+
+    By Stieltjes's recurrence and the eigenvalues of Golub and Welsch; the weights are over the density.
+    """
+    points, weights = np.polynomial.legendre.leggauss(20 * count)
+    weights = weights * np.exp(-0.5 * np.square(MAX_SIGMA * points))
+    total = weights.sum()
+    before, present, norm = np.zeros_like(points), np.full_like(points, total**-0.5), 0.0
+    diagonal, beside = np.zeros(count), np.zeros(count)
+    for k in range(count):
+        diagonal[k] = weights @ (points * present**2)
+        following = (points - diagonal[k]) * present - norm * before
+        norm = beside[k] = np.sqrt(weights @ following**2)
+        before, present = present, following / norm
+    nodes, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
+    return nodes, total * vectors[0] ** 2 * np.exp(0.5 * np.square(MAX_SIGMA * nodes))

@@ -5,12 +5,13 @@ cdef Py_ssize_t _LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE
 cdef Py_ssize_t _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH
 cdef double _BOUND_SIGMA, _MAX_CURRENT_FRACTION, _MIN_LOG_SPREADING_RATIO, _MIN_CURRENT_A, _MIN_LEFT
 cdef double _TWO_PI, _INFINITY, _NAN, _MAX_SIGMA, _MIN_RELATIVE_VARIANCE, _MAX_SPREAD, _UNLIMITED_SIGMA, _MAX_LOG_FORCE
+cdef double _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE
 cdef double _CONVERGED_SIGMA
 cdef Py_ssize_t _VALID, _LOWER_BOUND, _NOT_ESTIMATED, _WIDE, _MAX_STEPS
 
 cdef class StackTable:
     cdef double[::1] inverse, values, nodes
-    cdef Py_ssize_t inverse_intervals, intervals, node_count
+    cdef Py_ssize_t inverse_intervals, intervals, any_count, near_count
     cdef double inverse_first, inverse_width, first, per_width
 
 cdef class PadLaw:
@@ -32,7 +33,7 @@ cdef double _find_end(StackTable stack, PadLaw law, double log_spreading_m, doub
 @cython.locals(_=Py_ssize_t)
 cdef double _find_likely(
     StackTable stack, PadLaw law, ForceResult result, double left, double least, double top) noexcept
-@cython.locals(k=Py_ssize_t)
+@cython.locals(k=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, is_far=bint)
 cdef void _integrate(StackTable stack, PadLaw law, ForceResult result, double log_x2, double top) noexcept
 @cython.locals(k=Py_ssize_t)
 cdef void _evaluate(StackTable stack, PadLaw law, ForceResult result, double log_x2) noexcept

@@ -28,7 +28,11 @@ _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_C
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
 _TWO_PI, _INFINITY, _NAN = 2.0 * math.pi, math.inf, float("nan")
-_MAX_SIGMA = 3.3  # of the quadrature over the stack factor
+MAX_SIGMA = 3.3  # of the quadrature over the stack factor
+_MAX_SIGMA = MAX_SIGMA
+_MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE = 0.7, 2.0, 0.3, 0.05
+"""Limits within which a force is nearly log-normal: half the range of its logarithm; distance of the greatest
+one, shift of the range's middle and change of its half from those of a normal one, in such halves"""
 _MIN_RELATIVE_VARIANCE = 1e-18
 _MAX_SPREAD = 4.0
 """Mean times mean inverse of a force from which on its estimate is WIDE: open by a factor of three"""
@@ -54,12 +58,13 @@ class StackTable:
         first: float,
         width: float,
         nodes: memoryview[float],
+        any_count: int,
     ) -> None:
         self.inverse, self.inverse_intervals = inverse, len(inverse) // 4
         self.inverse_first, self.inverse_width = inverse_first, inverse_width
         self.values, self.intervals = values, len(values) // 2 - 1
         self.first, self.per_width = first, 1.0 / width
-        self.nodes, self.node_count = nodes, len(nodes) // 2
+        self.nodes, self.any_count, self.near_count = nodes, any_count, len(nodes) // 2 - any_count
 
 
 class PadLaw:
@@ -209,6 +214,7 @@ def _find_likely(
 def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float, top: float) -> None:
     """Integrate over ln x^2 up to `top`, about a likely one, at which the result was evaluated."""
     power = law.parameters[_POWER]
+    centre, half = log_x2 - result.sigma * result.step, _MAX_SIGMA * result.step
     low = max(stack.first, log_x2 - (_MAX_SIGMA + result.sigma) * result.step)
     high = min(top, log_x2 + (_MAX_SIGMA - result.sigma) * result.step)
     _evaluate(stack, law, result, low)
@@ -216,8 +222,15 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
     if high < top:
         _evaluate(stack, law, result, high)
         high = min(top, high + (_MAX_SIGMA - result.sigma) * result.step)
+    begin, end = 0, stack.any_count
+    # a radius that grows may reach an edge, where derivatives jump
+    is_far = law.parameters[_GROWTH] == 0.0 and top - centre > _MIN_NEAR_ROOM * half
+    if is_far and half * power < _MAX_NEAR_HALF:
+        shift, change = 0.5 * (low + high) - centre, 0.5 * (high - low) - half
+        if abs(shift) < _MAX_NEAR_SHIFT * half and abs(change) < _MAX_NEAR_CHANGE * half:
+            begin, end = end, end + stack.near_count
     weights = inverse = mean = square = 0.0
-    for k in range(stack.node_count):
+    for k in range(begin, end):
         at = low + (high - low) * stack.nodes[2 * k]
         _evaluate(stack, law, result, at)
         weight = stack.nodes[2 * k + 1] * math.exp(-0.5 * result.sigma * result.sigma) * result.density
