@@ -50,9 +50,10 @@ _MAX_SURFACE_ERROR = 1e-7
 _STACK_INTERVALS = 2048
 _MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
 _MIN_LOG_X2, _MAX_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1 / 16
-FORCE_NODES = 8
-"""Of the quadrature over ln x^2. Beside 80 nodes, on 18,000 contacts of random current, noise and place,
-forces are within 0.015 of their standard deviation, and that within 1 %; with 6 nodes within 0.06 and 5 %"""
+FORCE_NODES = 12
+"""Of the quadrature over ln x^2. Beside 96 nodes, on 3,703 contacts of random sheet, law, radius, current and
+place, up to the maximum current, forces are within 0.05 of their standard deviation (99 %: 0.007), and that
+within 9 % (99 %: 1 %); with 8 nodes within 0.14 and 9 % (99 %: 0.03 and 2 %)"""
 NEAR_FORCE_NODES = 5
 """The same where the force is nearly log-normal: beside 64 nodes, on 5,585 such contacts of 26,047 of random
 sheet, law, radius, current and place, forces are within 0.01 of their standard deviation, that within 2 %"""
