@@ -39,6 +39,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 NAMES = (*FAULTY, *FAULT_FREE)
+IDEAL_SHARE = 0.4
 FAULT_FREE_SHARE = 0.4
 """Episodes of each use without a fault, of those of each fault: soak_alarms plays hours of it."""
 NOTHING = "nothing"
@@ -89,6 +90,12 @@ def is_right(it: Episode, truth: str, found: Detected) -> bool:
     return kind == truth and link == it.link and at_s >= it.begin_s
 
 
+def episode_count(world: str, count: int) -> int:
+    """Return the number of episodes of each fault in a world, for `count` in `default`; of exact parts, fewer
+    tell as much."""
+    return max(1, round(IDEAL_SHARE * count)) if world == "ideal" else count
+
+
 def fault_free_count(count: int) -> int:
     """Return the number of episodes of each use without a fault, for `count` of each fault."""
     return max(1, round(FAULT_FREE_SHARE * count))
@@ -102,7 +109,7 @@ def run(count: int, workers: int, journal: Path | None) -> list[dict[str, Any]]:
         for seed in range(FIRST_SEED, FIRST_SEED + count)
         for world in WORLDS
         for name in NAMES
-        if name in FAULTY or seed < FIRST_SEED + fault_free_count(count)
+        if seed < FIRST_SEED + (episode_count(world, count) if name in FAULTY else fault_free_count(count))
     ]
     requested = {*every}
     found = [r for r in map(json.loads, lines) if (r["world"], r["name"], r["seed"]) in requested]
@@ -227,9 +234,9 @@ NOTE = (
     "with 95 % intervals (Clopper and Pearson, Poisson)."
 )
 HEAD = """\
-{count} episodes of each fault in each [world](../worlds.md) and {fault_free} of each use without one,
-{length:g} s on three pads of the shipped hand at 100 Hz: {hands} hands of each world, seeds of the reporting
-family, another one every {share} episodes. One pad has a fault while all are in use. An episode ends
+{count} episodes of each fault in each [world](../worlds.md), {ideal} in `ideal`, and {fault_free} of each use
+without one, {length:g} s on three pads of the shipped hand at 100 Hz: seeds of the reporting family, another
+hand every {share} episodes, {hands} of `default`. One pad has a fault while all are in use. An episode ends
 {settled:g} s after its fault was named, if there was no wrong diagnosis. The deployment file describes sheets
 as their builder would; all that the world draws is hidden from the diagnosis. Left out as not observable:
 cables of opposite electrodes swapped, which mirrors the pad, and short circuits between electrodes without
@@ -270,6 +277,7 @@ def main() -> None:
     )
     head = HEAD.format(
         count=count,
+        ideal=episode_count("ideal", count),
         fault_free=fault_free_count(count),
         length=LENGTH_S,
         settled=SETTLED_S,

@@ -208,7 +208,7 @@ By part, before the boot of the nodes:
 
 def main() -> int:
     parser = options(__doc__)
-    parser.add_argument("--runs", type=int, default=6)
+    parser.add_argument("--runs", type=int, default=5)
     asked = parser.parse_args()
     if asked.quick:
         asked.runs = 2

@@ -270,7 +270,7 @@ A hand of 15 pads at {RATE_HZ} Hz, all touched by sliding contacts, with joint s
 
 
 def main() -> None:
-    asked = asked_of(__doc__, seconds=5.0, turns=2, quick_s=2.0)
+    asked = asked_of(__doc__, seconds=5.0, turns=1, quick_s=2.0)
     if "HANDTOUCH_BENCH_PACKAGES" not in os.environ:
         with tempfile.TemporaryDirectory(prefix="ht.") as folder:
             os.environ["HANDTOUCH_BENCH_PACKAGES"] = str(browser_packages(Path(folder) / "js") or "")
