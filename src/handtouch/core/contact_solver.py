@@ -50,7 +50,8 @@ def make_solver(
         parts = np.full((model.size, PARTS_COUNT), np.nan)
     raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
     whitening = Whitening(
-        *(_work(n * n), _work(n), _work(n), _work((8 + 2 * most) * n), _work(part_count(n) * n), _work(n), n)
+        *(_work(n * n), _work(n), _work(n), _work((8 + 2 * most) * n), _work(part_count(n) * n)),
+        *(_work(n * (n + part_count(n))), _work(n), n),
     )
     fit = Fit(
         _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening

@@ -22,7 +22,7 @@ cdef class PartKnowledge:
     cdef Py_ssize_t size, rows, parts
 
 cdef class Whitening:
-    cdef double[::1] matrix, shift, modelled, fields, changes, vector
+    cdef double[::1] matrix, shift, modelled, fields, changes, vectors, vector
     cdef Py_ssize_t electrodes, channels
 
 cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
@@ -56,8 +56,8 @@ cdef void _add_states(
     double total) noexcept
 @cython.locals(
     n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
-    row=Py_ssize_t, vector='double[::1]', changes='double[::1]', axes='double[::1]',
-    offsets='double[::1]')
+    row=Py_ssize_t, count=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, vectors='double[::1]',
+    changes='double[::1]', axes='double[::1]', offsets='double[::1]')
 cdef void _add_parts(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
@@ -83,5 +83,7 @@ cdef void _add_second_derivatives(
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t)
 cdef void _add_square(double[::1] matrix, double[::1] vector, Py_ssize_t n) noexcept
+@cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)
+cdef void _add_squares(double[::1] matrix, double[::1] vectors, Py_ssize_t count, Py_ssize_t n) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t)
 cdef void _invert_root(double[::1] matrix, Py_ssize_t n) noexcept

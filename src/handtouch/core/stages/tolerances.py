@@ -99,7 +99,7 @@ class Whitening:
     """Whitening of currents over noise: `matrix` (n n,) is lower triangular; its product with currents that
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
     to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (8 n
-    and 2 n for each state,), `changes` (p n,), `vector` (n,): working memory.
+    and 2 n for each state,), `changes` (p n,), `vectors` (n (n + p),), `vector` (n,): working memory.
     `electrodes` is n of the present pad, `channels` that of the pad with most.
     """
 
@@ -110,11 +110,12 @@ class Whitening:
         modelled: memoryview[float],
         fields: memoryview[float],
         changes: memoryview[float],
+        vectors: memoryview[float],
         vector: memoryview[float],
         channels: int,
     ) -> None:
         self.matrix, self.shift, self.modelled = matrix, shift, modelled
-        self.fields, self.changes, self.vector = fields, changes, vector
+        self.fields, self.changes, self.vectors, self.vector = fields, changes, vectors, vector
         self.electrodes = self.channels = channels
 
 
@@ -278,21 +279,25 @@ def _add_states(
 
 def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, number: int) -> None:
     """Add the covariance by gains and parts, which all contacts share; set the shift."""
-    n, vector, changes = whitening.electrodes, whitening.vector, whitening.changes
+    n, vectors, changes = whitening.electrodes, whitening.vectors, whitening.changes
     parts = part_count(n)
     size, axes, offsets, varied = n + parts, known.axes, known.offsets, 0
     if not pad.is_shape_exact:
         varied = parts if pad.has_series else parts - n - 1
-    for k in range(n + varied):
+    count = n + varied
+    for k in range(count):
         row = number * known.size + k * size
+        begin, end = max(k - n, 0), min(known.ends[number * known.rows + k] - n, varied)
+        if k >= n and end == begin + 1:  # a part of which nothing was learned
+            for i in range(n):
+                vectors[i * count + k] = axes[row + k] * changes[begin * n + i]
+            continue
         for i in range(n):
-            vector[i] = axes[row + i] * whitening.modelled[i] if i >= k else 0.0
-        for j in range(max(k - n, 0), min(known.ends[number * known.rows + k] - n, varied)):
-            step = axes[row + n + j]
-            if step != 0.0:
-                for i in range(n):
-                    vector[i] += step * changes[j * n + i]
-        _add_square(whitening.matrix, vector, n)
+            change = axes[row + i] * whitening.modelled[i] if i >= k else 0.0
+            for j in range(begin, end):
+                change += axes[row + n + j] * changes[j * n + i]
+            vectors[i * count + k] = change
+    _add_squares(whitening.matrix, vectors, count, n)
     for j in range(varied):
         step = offsets[number * known.parts + j]
         if step != 0.0:
@@ -401,6 +406,16 @@ def _add_square(matrix: memoryview[float], vector: memoryview[float], n: int) ->
         factor = vector[i]
         for j in range(i + 1):
             matrix[i * n + j] += factor * vector[j]
+
+
+def _add_squares(matrix: memoryview[float], vectors: memoryview[float], count: int, n: int) -> None:
+    """Add the squares of vectors, (n count,) with a column each, to the lower triangle of a matrix (n n,)."""
+    for i in range(n):
+        for j in range(i + 1):
+            value = matrix[i * n + j]
+            for k in range(count):
+                value += vectors[i * count + k] * vectors[j * count + k]
+            matrix[i * n + j] = value
 
 
 def _invert_root(matrix: memoryview[float], n: int) -> None:
