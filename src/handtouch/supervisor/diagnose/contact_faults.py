@@ -40,6 +40,8 @@ _MIN_EVIDENCE_SIMILAR_NATS = 18.0
 """The same for gain steps and torn corners, whose sizes are free."""
 MIN_SEPARATION_NATS = 6.0
 """Margin over faults of other kinds; far from the corner, a torn corner looks like a gain step."""
+_MIN_SEPARATION_LONG_NATS = 12.0
+"""The same between gain steps and torn corners of a long pad, which show in two small currents."""
 CLEAR_NATS = 8.0
 """Margin of a pad without a fault over the diagnosed one that ends the diagnosis."""
 _MAX_SUM_NATS = 4 * SUSPICION_NATS
@@ -67,6 +69,8 @@ _MAX_SILENT_FRACTION, _SHARE_CELLS = 0.005, 16
 """Of the total current, in a channel that carries nothing; cells of each share of such a contact."""
 _MIN_CONTACTS_SIMILAR = 12
 """Contacts of a fault of free size: fewer fit one of the sizes now and then."""
+_MIN_SILENT_SHARE, _SILENT_NATS = 0.9, 30.0
+"""Share of contacts without a current in a dead electrode's channel, and what that adds to its evidence."""
 _KINDS_WITH_ALTERNATIVES = (*_SIMILAR_KINDS, FaultKind.SWAPPED_CABLES)
 """Kinds that are diagnosed while it is open which electrodes are concerned."""
 
@@ -172,6 +176,8 @@ class ContactFaultDetector:
             return
         suspects = self._suspects(suspected & ~self._last_resort)
         best = self._compare(suspects) if suspects else None
+        if best is not None and self._tables.is_long:
+            best = self._compare([*suspects, *self._besides(best.hypothesis, suspects)])
         if best is None and self._fault is None and suspected[self._last_resort].any():
             best = self._unexplained(suspects)
         if best is not None and (best.rival is None or self._fault is None):
@@ -190,6 +196,26 @@ class ContactFaultDetector:
                 suspects.append(index)
         return suspects[:_MAX_SUSPECTS]
 
+    def _besides(self, found: Hypothesis, suspects: Sequence[int]) -> list[int]:
+        """Return hypotheses that a fault of a long pad must beat without their being suspected."""
+        kinds = {FaultKind.DEAD_ELECTRODE}
+        if found.kind in _SIMILAR_KINDS:
+            kinds |= _SIMILAR_KINDS
+        also = np.flatnonzero(np.isin(self._tables.kinds, list(kinds))).tolist()
+        return sorted(set(also) - set(suspects))
+
+    def _silent_nats(self, hypothesis: Hypothesis, count: int) -> float:
+        """Return what a dead electrode gains if its channel carried nothing in nearly all of the contacts.
+
+        Other faults can explain each of them by where the pad was pressed, but not that none was elsewhere.
+        """
+        if not self._tables.is_long or hypothesis.kind != FaultKind.DEAD_ELECTRODE:
+            return 0.0
+        currents = np.array([one.contact.currents for one in list(self._contacts)[-count:]])
+        channel = self._tables.electrodes.index(hypothesis.electrodes[0])
+        silent = np.abs(currents[:, channel]) < _MAX_SILENT_FRACTION * currents.sum(axis=1)
+        return _SILENT_NATS if silent.mean() >= _MIN_SILENT_SHARE else 0.0
+
     def _compare(self, suspects: Sequence[int]) -> ContactFault | None:
         """Return the fault that explains the contacts best, each with its likeliest begin; None if none does
         by far."""
@@ -200,30 +226,35 @@ class ContactFaultDetector:
         every = np.where(
             similar & (counts < _MIN_CONTACTS_SIMILAR)[:, None], -np.inf, nats[:, 1:] - nats[:, :1]
         )
-        margins = every.max(axis=0)
-        best = int(margins.argmax())
+        margins, counts = every.max(axis=0), counts[every.argmax(axis=0)]
+        silent = [self._silent_nats(h, count) for h, count in zip(hypotheses, counts.tolist(), strict=True)]
+        standing = margins + silent
+        best = int(standing.argmax())
         if margins[best] < MIN_EVIDENCE_NATS:
             return None
         found = hypotheses[best]
         if found.kind in _SIMILAR_KINDS and margins[best] < _MIN_EVIDENCE_SIMILAR_NATS:
             return None
         same = np.array([h.kind == found.kind for h in hypotheses])
-        near = margins > margins[best] - MIN_SEPARATION_NATS
-        rivals = [hypotheses[k] for k in np.argsort(-margins).tolist() if near[k] and not same[k]]
+        apart = np.full(len(hypotheses), MIN_SEPARATION_NATS)
+        if self._tables.is_long and found.kind in _SIMILAR_KINDS:
+            apart[similar & ~same] = _MIN_SEPARATION_LONG_NATS
+        near = standing > standing[best] - apart
+        rivals = [hypotheses[k] for k in np.argsort(-standing).tolist() if near[k] and not same[k]]
         also = tuple(h for h, close in zip(hypotheses, near & same, strict=True) if close and h is not found)
         clear = margins[best] > 2 * MIN_EVIDENCE_NATS
         if rivals and not (clear and {found.kind, rivals[0].kind} == _SIMILAR_KINDS):
             return None  # more contacts may decide
         if any(h.electrodes != found.electrodes for h in also) and found.kind not in _KINDS_WITH_ALTERNATIVES:
             return None
-        logits = np.append((margins - margins[best])[~same], -margins[best]) / _NATS_PER_LOGIT
+        logits = np.append((standing - standing[best])[~same], -margins[best]) / _NATS_PER_LOGIT
         return ContactFault(
             found,
             also,
             float(margins[best]),
             float(1 / (1 + np.exp(logits).sum())),
             int(self._since_ns[suspects[best]]),
-            int(counts[every[:, best].argmax()]),
+            int(counts[best]),
             rivals[0] if rivals else None,
         )
 

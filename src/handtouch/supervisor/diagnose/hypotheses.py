@@ -30,11 +30,20 @@ MIN_CHANNELS = _UNKNOWNS + 1
 _GAIN_TOLERANCE_STD = 0.02
 """Of a channel's gain, as noise of log likelihood ratios, which raise suspicions only."""
 _SEARCH_TOLERANCE = 0.02  # of each current, in the search of the first node
-_NODES_PER_SIDE = 25
-_NODE_FRACTIONS = np.linspace(0.02, 0.98, _NODES_PER_SIDE)
+_BOUND_STIFFNESS = 1e4
+_SEARCH_REACH = (1 / 6, 1 / 6, 1 / 8, 1 / 12, 1 / 24, 1 / 24)
+"""Fractions of the sides that the steps of the search for scores go at most."""
+_NODES_PER_SIDE, _MAX_NODES_PER_SIDE = 25, 73  # of the shorter side, of the longer one of a long pad
+_LONG_RATIO = 2.0
+"""Ratio of the sides from which the nodes of the longer side are as close as those of the shorter one: the
+current of an electrode far along a strip falls by a factor e within a third of its width."""
+_FIRST_NODE, _LAST_NODE = 0.02, 0.98  # fractions of a side
 _MODEL_ERROR_FRACTION = 1e-3  # of the total: what the model neglects
 _TORN_MODEL_ERROR_FRACTION = 5e-3  # of the total: few sizes of cuts, coarse grids
 _SCORE_MODEL_ERROR_FRACTION = 3e-3  # of the total, for scores: the same for all hypotheses
+_LONG_MODEL_ERROR_FRACTION, _LONG_MODEL_ERROR_OF_CURRENT = 5e-4, 0.03
+"""Of the total, and of a channel's own current, up to the above, on a long pad: far from an electrode, its
+current and the model's error decay alike, and carry the evidence."""
 _NON_POINT_PROBABILITIES = np.array(
     [0.03, 0.5]
 )  # of all contacts: usually, and while two objects are handled
@@ -90,7 +99,8 @@ class Scores(NamedTuple):
 class HypothesisTables:
     """Current shares under each hypothesis, for one design of pad with at least `MIN_CHANNELS`.
 
-    electrodes: names of the c electrodes. parts: networks in each of which one part differs by one standard
+    electrodes: names of the c electrodes. is_long: whether currents of far sides are small over much of the
+    pad. parts: networks in each of which one part differs by one standard
     deviation.
     """
 
@@ -104,7 +114,11 @@ class HypothesisTables:
         self.hypotheses: list[Hypothesis] = []
         self.electrodes, c = electrodes, len(electrodes)
         self._freedom = c - _UNKNOWNS
-        x, y = _nodes(network)
+        self._sides = sides = _node_fractions(network)
+        self.is_long = max(network.a, network.b) >= _LONG_RATIO * min(network.a, network.b)
+        self._least_model_error = _LONG_MODEL_ERROR_FRACTION if self.is_long else _SCORE_MODEL_ERROR_FRACTION
+        x, y = _nodes(network, sides)
+        shape = len(sides[0]), len(sides[1])
         nominal = network.fractions(x, y).T
         series = np.array(network.series_ohm)
         orders, factors = [np.arange(c)], [np.ones(c)]
@@ -118,7 +132,7 @@ class HypothesisTables:
             orders.append(np.arange(c))
             factors.append(np.where(np.arange(c) == channel, 1 / factor, 1.0))
         self._orders, self._factors = np.array(orders).T, np.array(factors).T
-        self._nominal = _FractionTable(nominal[None])
+        self._nominal = _FractionTable(nominal[None], shape)
         others = []
         for channel in range(c):
             self.hypotheses.append(Hypothesis(FaultKind.DEAD_ELECTRODE, (electrodes[channel],)))
@@ -131,13 +145,13 @@ class HypothesisTables:
                     Hypothesis(FaultKind.SHORTED_ELECTRODE, (electrodes[i], electrodes[j]))
                 )
                 others.append(merged)
-        self._electrode_faults = _FractionTable(np.stack(others))
+        self._electrode_faults = _FractionTable(np.stack(others), shape)
         torn = self._torn_pads(network, surface, nominal) if isinstance(network, ElectrodeNetwork) else []
-        self._torn = _FractionTable(np.reshape(torn, (len(torn), *nominal.shape)))
+        self._torn = _FractionTable(np.reshape(torn, (len(torn), *nominal.shape)), shape)
         self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
         varied = (part for part in parts if part is not network)
-        tolerances = [part.fractions(*_nodes(part)).T - nominal for part in varied]
+        tolerances = [part.fractions(*_nodes(part, sides)).T - nominal for part in varied]
         no_cut = np.zeros((2, *nominal.shape))
         self._tolerances = np.array([*tolerances, *no_cut, *(nominal * channel for channel in np.eye(c))])
 
@@ -146,7 +160,7 @@ class HypothesisTables:
     ) -> list[FloatArray]:
         """Add the hypotheses of torn corners; return their fractions (P, c)."""
         pads = []
-        sheet = SheetChanges(network, surface, _NODE_FRACTIONS)
+        sheet = SheetChanges(network, surface, self._sides)
         cuts = list(itertools.product(CORNERS, _CUT_FRACTIONS, _CUT_FRACTIONS))
         changes = sheet.by_cuts((CORNERS[corner], p, q) for corner, p, q in cuts)
         for (corner, p, q), (change, beyond) in zip(cuts, changes, strict=True):
@@ -194,25 +208,68 @@ class HypothesisTables:
             tolerances = tolerances.copy()
             gains = len(tolerances) - len(self.electrodes)
             tolerances[gains - 2 : gains] = _CUT_STEP_STD * self._torn.changes_by_cut(pad)
-        sigma = np.hypot(noise, _SCORE_MODEL_ERROR_FRACTION * currents.sum(axis=0))
+        total = currents.sum(axis=0)
+        model_error = np.clip(
+            _LONG_MODEL_ERROR_OF_CURRENT * np.abs(currents),
+            self._least_model_error * total,
+            _SCORE_MODEL_ERROR_FRACTION * total,
+        )
+        sigma = np.hypot(noise, model_error)
         return table.score(pad, currents, sigma, tolerances)
 
 
-def _nodes(network: FractionModel) -> tuple[FloatArray, FloatArray]:
-    x, y = np.meshgrid(_NODE_FRACTIONS * network.a, _NODE_FRACTIONS * network.b, indexing="ij")
+def _node_fractions(network: FractionModel) -> tuple[FloatArray, FloatArray]:
+    """Return the nodes along x and along y, as fractions of the sides."""
+    sides = np.array([network.a, network.b])
+    ratios = sides / sides.min()
+    intervals = (_NODES_PER_SIDE - 1) * np.where(ratios < _LONG_RATIO, 1.0, ratios)
+    counts = np.minimum(1 + 2 * np.ceil(intervals / 2).astype(int), _MAX_NODES_PER_SIDE).tolist()
+    x, y = (np.linspace(_FIRST_NODE, _LAST_NODE, count) for count in counts)
+    return x, y
+
+
+def _nodes(network: FractionModel, sides: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    x, y = np.meshgrid(sides[0] * network.a, sides[1] * network.b, indexing="ij")
     return x.ravel(), y.ravel()
 
 
-class _FractionTable:
-    """Fractions (t, P, c) of t pads on the grid, and their slopes: in single precision, as they are many."""
+class _Fit(NamedTuple):
+    """Fits of k contacts: nodes (2, k), steps (k, 3) from these by log total and position, whitened Jacobian
+    (3, c, k), misfit (c, k) that is left, Gram matrix (k, 3, 3), and where undetermined (k,)."""
 
-    def __init__(self, exact: FloatArray) -> None:
-        self._fractions = fractions = exact.astype(np.float32)
-        cube = fractions.reshape(-1, _NODES_PER_SIDE, _NODES_PER_SIDE, fractions.shape[2])
-        self._slopes = np.stack([v.reshape(fractions.shape) for v in np.gradient(cube, axis=(1, 2))])
-        self._coarse = (
-            np.arange(_NODES_PER_SIDE**2).reshape(_NODES_PER_SIDE, _NODES_PER_SIDE)[::2, ::2].ravel()
+    node: NDArray[np.intp]
+    step: FloatArray
+    jacobian: FloatArray
+    misfit: FloatArray
+    gram: FloatArray
+    undetermined: NDArray[np.bool_]
+
+    def better_of(self, other: _Fit) -> _Fit:
+        """Return the fits that leave less, contact by contact."""
+        mine, its = ((fit.misfit**2).sum(axis=0) + 1e9 * fit.undetermined for fit in (self, other))
+        take = its < mine
+        return _Fit(
+            np.where(take, other.node, self.node),
+            np.where(take[:, None], other.step, self.step),
+            np.where(take, other.jacobian, self.jacobian),
+            np.where(take, other.misfit, self.misfit),
+            np.where(take[:, None, None], other.gram, self.gram),
+            np.where(take, other.undetermined, self.undetermined),
         )
+
+
+class _FractionTable:
+    """Fractions (t, P, c) of t pads on the grid, and their slopes: in single precision, as they are many.
+
+    shape: nodes along x and y, P of them, odd numbers.
+    """
+
+    def __init__(self, exact: FloatArray, shape: tuple[int, int]) -> None:
+        self._fractions = fractions = exact.astype(np.float32)
+        self._shape, self._is_long = shape, max(shape) > _NODES_PER_SIDE
+        cube = fractions.reshape(-1, *shape, fractions.shape[2])
+        self._slopes = np.stack([v.reshape(fractions.shape) for v in np.gradient(cube, axis=(1, 2))])
+        self._coarse = np.arange(shape[0] * shape[1]).reshape(shape)[::2, ::2].ravel()
         self._coarse_fractions = np.ascontiguousarray(fractions[:, self._coarse])
         self._coarse_squares = self._coarse_fractions**2
 
@@ -223,17 +280,21 @@ class _FractionTable:
         nearest node of a coarse grid, then two Gauss-Newton steps.
         """
         table, node = self._nearest_nodes(data, sigma)
-        _, _, misfit, gram, undetermined = self._refine(table, node, data, sigma)
-        volume = np.where(undetermined, _MIN_LOG_LIKELIHOOD, -0.5 * np.linalg.slogdet(gram)[1])
-        return np.asarray(volume - 0.5 * (misfit**2).sum(axis=0)), np.asarray(volume)
+        fit = self._refine(table, node, data, sigma)
+        volume = np.where(fit.undetermined, _MIN_LOG_LIKELIHOOD, -0.5 * np.linalg.slogdet(fit.gram)[1])
+        return np.asarray(volume - 0.5 * (fit.misfit**2).sum(axis=0)), np.asarray(volume)
 
     def score(self, pad: int, data: FloatArray, sigma: FloatArray, tolerances: FloatArray) -> Scores:
         """Return the scores of data (c, k) with standard deviations on one pad; tolerances (t, P, c)."""
         node = self._nearest_nodes(data, np.hypot(sigma, _SEARCH_TOLERANCE * data), pad)[1]
         table = np.full(data.shape[1], pad)
-        node, jacobian, misfit, _, undetermined = self._refine(table, node, data, sigma)
+        node, _, jacobian, misfit, _, undetermined = (
+            self._search(table, node, data, sigma)
+            if self._is_long
+            else self._refine(table, node, data, sigma)
+        )
         null = np.linalg.svd(jacobian.transpose(2, 1, 0), full_matrices=True)[0][:, :, _UNKNOWNS:]
-        flat = node[0] * _NODES_PER_SIDE + node[1]
+        flat = self._flat(node)
         total = np.maximum(data.sum(axis=0), 1e-30)
         slopes = np.einsum("kcs,tkc->kst", null * (total / sigma).T[:, :, None], tolerances[:, flat])
         scores = np.einsum("kcs,ck->ks", null, misfit)
@@ -268,39 +329,87 @@ class _FractionTable:
         along = self._coarse_fractions[one] @ (weight * data)  # (t, P, k)
         norm = self._coarse_squares[one] @ weight
         best = np.argmax(np.maximum(along, 0) * along / (norm + 1e-300), axis=1)
-        node = np.stack(np.divmod(self._coarse[best.ravel()], _NODES_PER_SIDE))
+        node = np.stack(np.divmod(self._coarse[best.ravel()], self._shape[1]))
         return np.indices(best.shape)[0].ravel(), node
 
     def _refine(
         self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
-    ) -> tuple[NDArray[np.intp], FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Return nodes, Jacobian, misfit, its Gram matrix and where undetermined, after Gauss-Newton."""
-        for reach in (2, 1):  # not beyond the next node
-            jacobian, misfit = self._linearise(table, node, data, sigma)
-            gram = np.einsum("pck,qck->kpq", jacobian, jacobian)
-            size = np.trace(gram, axis1=1, axis2=2)
-            undetermined = size <= 0  # no node collects such currents
-            gram += np.eye(3) * np.where(undetermined, 1.0, 1e-9 * size)[:, None, None]
-            step = np.linalg.solve(gram, np.einsum("pck,ck->kp", jacobian, misfit)[:, :, None])[:, :, 0]
+    ) -> _Fit:
+        """Return a fit after two Gauss-Newton steps, of two nodes and one."""
+        return self._step(table, self._move(self._step(table, node, data, sigma, 2), table), data, sigma, 1)
+
+    def _search(
+        self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
+    ) -> _Fit:
+        """Return the best fit of several Gauss-Newton steps, for where the first node may be far off."""
+        best = self._step(table, node, data, sigma, 1)
+        fit = best
+        intervals = np.array(self._shape) - 1.0
+        for part in _SEARCH_REACH:
+            node = self._move(self._step(table, fit.node, data, sigma, part * intervals), table)
+            fit = self._step(table, node, data, sigma, 1)
+            best = best.better_of(fit)
+        return best
+
+    def _move(self, fit: _Fit, table: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the nodes (2, k) nearest to the ends of the steps; the same where those are cut off."""
+        moved = fit.node + np.rint(fit.step[:, 1:].T).astype(np.intp)
+        moved = np.clip(moved, 0, np.array(self._shape)[:, None] - 1)
+        there = self._fractions[table, self._flat(moved), 0] > 0
+        return np.where(there, moved, fit.node)
+
+    def _step(
+        self,
+        table: NDArray[np.intp],
+        node: NDArray[np.intp],
+        data: FloatArray,
+        sigma: FloatArray,
+        reach: float | FloatArray,
+    ) -> _Fit:
+        """Return the fit by one Gauss-Newton step from nodes (2, k), by some nodes at most."""
+        jacobian, misfit = self._linearise(table, node, data, sigma)
+        gram = np.einsum("pck,qck->kpq", jacobian, jacobian)
+        size = np.trace(gram, axis1=1, axis2=2)
+        undetermined = size <= 0  # no node collects such currents
+        gram += np.eye(3) * np.where(undetermined, 1.0, 1e-9 * size)[:, None, None]
+        gradient = np.einsum("pck,ck->kp", jacobian, misfit)
+        step = np.linalg.solve(gram, gradient[:, :, None])[:, :, 0]
+        if self._is_long:
+            step = _solve_within(gram, gradient, reach)
+        else:
             step[:, 1:] = np.clip(step[:, 1:], -reach, reach)
-            if reach > 1:
-                moved = np.clip(node + np.rint(step[:, 1:].T).astype(np.intp), 0, _NODES_PER_SIDE - 1)
-                there = (
-                    self._fractions[table, moved[0] * _NODES_PER_SIDE + moved[1], 0] > 0
-                )  # and not cut off
-                node = np.where(there, moved, node)
         misfit = misfit - np.einsum("kp,pck->ck", step, jacobian)
-        return node, jacobian, misfit, gram, undetermined
+        return _Fit(node, step, jacobian, misfit, gram, undetermined)
+
+    def _flat(self, node: NDArray[np.intp]) -> NDArray[np.intp]:
+        return np.asarray(node[0] * self._shape[1] + node[1])
 
     def _linearise(
         self, table: NDArray[np.intp], node: NDArray[np.intp], data: FloatArray, sigma: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return whitened Jacobian (3, c, k) by log total and position, and misfit, at nodes (2, k)."""
-        flat = node[0] * _NODES_PER_SIDE + node[1]
+        flat = self._flat(node)
         f = self._fractions[table, flat].T
         slopes = self._slopes[:, table, flat].transpose(0, 2, 1)
         total = np.maximum((f * data / sigma**2).sum(0) / ((f / sigma) ** 2).sum(0).clip(1e-300), 1e-12)
         return np.stack([f, slopes[0], slopes[1]]) * total / sigma, (data - total * f) / sigma
+
+
+def _solve_within(gram: FloatArray, gradient: FloatArray, reach: float | FloatArray) -> FloatArray:
+    """Return steps (k, 3) with positions within +-reach: one that is at its bound is kept there for the
+    others."""
+    step = np.linalg.solve(gram, gradient[:, :, None])[:, :, 0]
+    limit = np.append(np.inf, np.broadcast_to(reach, 2))
+    for _ in range(2):
+        bound = np.zeros(step.shape)
+        bound[:, 1:] = _BOUND_STIFFNESS * np.trace(gram, axis1=1, axis2=2)[:, None]
+        bound[:, 1:] *= np.abs(step[:, 1:]) >= reach
+        if not bound.any():
+            break
+        held = gradient + bound * np.clip(step, -limit, limit)
+        step = np.linalg.solve(gram + bound[:, :, None] * np.eye(3), held[:, :, None])[:, :, 0]
+    step[:, 1:] = np.clip(step[:, 1:], -reach, reach)
+    return np.asarray(step)
 
 
 def _swap_permutations(network: RectangleNetwork, channels: int) -> list[NDArray[np.intp]]:

@@ -27,9 +27,12 @@ CORNERS = {("x0", "y0"): (0, 0), ("x0", "yb"): (0, 1), ("xa", "y0"): (1, 0), ("x
 
 
 class SheetChanges:
-    """Changes of the shares at a grid of positions, `at` (k,) fractions of the sides of a pad's rectangle."""
+    """Changes of the shares at a grid of positions, `at` (k,) and (l,) fractions of the sides of a pad's
+    rectangle along x and y."""
 
-    def __init__(self, network: ElectrodeNetwork, surface: Surface, at: FloatArray) -> None:
+    def __init__(
+        self, network: ElectrodeNetwork, surface: Surface, at: tuple[FloatArray, FloatArray]
+    ) -> None:
         self._network = network
         nodes = np.linspace(0, 1, _CELLS_PER_SIDE + 1)
         x, y = np.meshgrid(nodes, nodes, indexing="ij")
@@ -37,7 +40,7 @@ class SheetChanges:
         arc = surface.from_rectangle(along * network.a, 0 * along)[0] / surface.extent_m[0]
         self._x, self._y = np.interp(x, along, arc), y
         self._owner = _electrode_of_nodes(network, x, y)
-        grid = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1)
+        grid = np.stack(np.meshgrid(*at, indexing="ij"), axis=-1)
         self._at = np.interp(grid[..., 0], along, arc), grid[..., 1]
         self._grid, self._nodes = grid, nodes
         self._series_ohm = np.minimum(network.series_ohm, _OPEN_OHM)
@@ -46,7 +49,7 @@ class SheetChanges:
     def by_cuts(
         self, cuts: Iterable[tuple[tuple[int, int], float, float]]
     ) -> Iterator[tuple[FloatArray, NDArray[np.bool_]]]:
-        """Yield the change (k, k, 4), x first, by each cut, and a mask of the positions beyond it.
+        """Yield the change (k, l, 4), x first, by each cut, and a mask of the positions beyond it.
 
         cuts: corner (0 or 1 along x, y), fractions of the sides. A cut is straight in arc length and angle.
         """
