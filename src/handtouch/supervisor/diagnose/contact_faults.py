@@ -71,6 +71,8 @@ _MIN_CONTACTS_SIMILAR = 12
 """Contacts of a fault of free size: fewer fit one of the sizes now and then."""
 _MIN_SILENT_SHARE, _SILENT_NATS = 0.9, 30.0
 """Share of contacts without a current in a dead electrode's channel, and what that adds to its evidence."""
+_SIMILAR_STEP = 3
+"""Of the hypotheses of gain steps and torn corners, those that one of a long pad must beat unsuspected."""
 _KINDS_WITH_ALTERNATIVES = (*_SIMILAR_KINDS, FaultKind.SWAPPED_CABLES)
 """Kinds that are diagnosed while it is open which electrodes are concerned."""
 
@@ -198,10 +200,11 @@ class ContactFaultDetector:
 
     def _besides(self, found: Hypothesis, suspects: Sequence[int]) -> list[int]:
         """Return hypotheses that a fault of a long pad must beat without their being suspected."""
-        kinds = {FaultKind.DEAD_ELECTRODE}
+        kinds = self._tables.kinds
+        also = np.flatnonzero(kinds == FaultKind.DEAD_ELECTRODE).tolist()
         if found.kind in _SIMILAR_KINDS:
-            kinds |= _SIMILAR_KINDS
-        also = np.flatnonzero(np.isin(self._tables.kinds, list(kinds))).tolist()
+            for kind in sorted(_SIMILAR_KINDS):
+                also += np.flatnonzero(kinds == kind)[::_SIMILAR_STEP].tolist()
         return sorted(set(also) - set(suspects))
 
     def _silent_nats(self, hypothesis: Hypothesis, count: int) -> float:
