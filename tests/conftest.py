@@ -33,11 +33,13 @@ settings.load_profile("shared cores")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 ROOT = Path(__file__).parents[1]
+BUILDS_WHEEL = "test_packaging.py"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long files first, so that workers end together. Without SocketCAN skip its tests; in vcan-run it is."""
-    items.sort(key=lambda item: "end_to_end" not in item.path.parts)
+    """The file that builds the wheel first, which others wait for, then long ones, so that workers end
+    together. Without SocketCAN skip its tests; in vcan-run it is."""
+    items.sort(key=lambda item: (item.path.name != BUILDS_WHEEL, "end_to_end" not in item.path.parts))
     if "VCAN_RUN" in os.environ or Path("/sys/class/net/vcan0").exists():
         return
     skip = pytest.mark.skip(reason="no vcan0 here; `make socketcan` runs these tests where there is one")
