@@ -16,8 +16,9 @@ from handtouch.supervisor import diagnose
 from handtouch.supervisor.ipc import FloatArray, SampleBlock
 from handtouch.wire.diagnosis import Diagnosis
 
-_BLOCK_DURATION_NS = 250_000_000
-"""Duration of the samples that are diagnosed together."""
+_BLOCK_DURATION_NS, _BLOCK_TICKS = 250_000_000, 20
+"""Least duration and number of the samples that are diagnosed together: of fewer, slow or from an overloaded
+host, a short mean would join positions of a sliding contact, with no other to compare it with."""
 
 
 class DeploymentDiagnostics:
@@ -47,7 +48,8 @@ class DeploymentDiagnostics:
     def process_block(self, block: SampleBlock) -> Sequence[tuple[int, Diagnosis]]:
         """Process a block; return the active diagnoses with their pads, updated every quarter of a second."""
         self._pending.append(block)
-        if block.sync_ns[-1] - self._pending[0].sync_ns[0] < _BLOCK_DURATION_NS:
+        duration_ns = block.sync_ns[-1] - self._pending[0].sync_ns[0]
+        if duration_ns < _BLOCK_DURATION_NS or sum(len(one.sync_ns) for one in self._pending) < _BLOCK_TICKS:
             return self._diagnoses
         blocks, self._pending = self._pending, []
         sample_ns, counts, fresh = (
