@@ -110,3 +110,12 @@ def test_gain_step_of_a_long_pad_is_no_torn_corner(channel: int) -> None:
     factors = np.where(np.arange(4) == channel, 0.4, 1.0)
     shares[40:] *= factors
     assert name_fault(shares) in (FaultKind.GAIN_STEP, FaultKind.UNEXPLAINED)
+
+
+@pytest.mark.parametrize("channel", [1, 2, 3])
+def test_dead_electrode_of_a_long_pad_that_is_touched_beside_it_is_named(channel: int) -> None:
+    """The far electrode carries nothing, either; that is no evidence against it."""
+    network = long_pad()[0]
+    x, y = positions(60)
+    shares = network.with_open_electrode(channel).fractions(network.a - (network.a - x) / 4, y).T
+    assert name_fault(shares) == FaultKind.DEAD_ELECTRODE

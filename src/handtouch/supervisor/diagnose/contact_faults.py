@@ -231,7 +231,7 @@ class ContactFaultDetector:
         )
         margins, counts = every.max(axis=0), counts[every.argmax(axis=0)]
         silent = [self._silent_nats(h, count) for h, count in zip(hypotheses, counts.tolist(), strict=True)]
-        standing = margins + silent
+        standing = margins + np.where(margins >= MIN_EVIDENCE_NATS, silent, 0.0)
         best = int(standing.argmax())
         if margins[best] < MIN_EVIDENCE_NATS:
             return None
