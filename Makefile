@@ -89,9 +89,8 @@ tables: $(VENV)/.dev ## write docs/wire.schema.json and the tables of docs/wire.
 wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
-# three at a time on CI's two cores: tests of whole processes wait a third of their time
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
-	$(BIN)/python -m pytest -m "not socketcan" -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"

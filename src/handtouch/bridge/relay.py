@@ -80,15 +80,17 @@ class Relay:
         source = self._source
         assert source is not None
         parts = source.recv_parts(longest_s)
-        if source.has_received and source.alive != (self._token is not None):
-            self._set_alive(source.alive)
+        if source.has_received and source.alive and self._token is None:
+            self._set_alive(True)
         for _ in range(_MAX_MESSAGES_PER_POLL):
             if parts is None:
-                return
+                break
             self._publish(*parts)
             parts = source.recv_parts(0)
         if parts is not None:
             self._publish(*parts)
+        elif self._token is not None and not source.alive:  # its last messages have been relayed
+            self._set_alive(False)
         if source.lost_messages != self._reported_losses:
             lost, self._reported_losses = source.lost_messages - self._reported_losses, source.lost_messages
             _log.warning("%s: %d messages lost between daemon and bridge", self.root, lost)
@@ -124,10 +126,10 @@ class Relay:
         if alive:
             self._token = self._session.liveliness().declare_token(self.root)
         elif self._token is not None:
-            self._token.undeclare()
-            self._token = None
             with self._lock:
                 self._latest.clear()
+            self._token.undeclare()
+            self._token = None
         _log.log(
             logging.INFO if alive else logging.WARNING,
             "%s: daemon %s",
