@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 from pathlib import Path
 
 import numpy as np
-import pytest
 from daemon_settings import pipeline_of
 from hand_touches import serve
 from numpy.typing import NDArray
@@ -23,7 +21,6 @@ from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.field import Rectangle
 from handtouch.wire import PadState
 
-ROOT = Path(__file__).parents[2]
 TICKS = 60
 
 
@@ -95,17 +92,6 @@ def test_a_benchmark_of_touches_has_the_contact_of_every_touched_pad() -> None:
     assert {key: contact.link for key, contact in contacts.items()} == {
         (7, link): link for link in model.links[:2]
     }
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
-def test_benchmarks_estimate_gains_as_automatic_calibration_does(path: Path) -> None:
-    """The store's stress test needs any estimators; the others measure the daemon's. Beside it, the page of
-    gains has one that assumes what its bound does."""
-    others = {"stress_store": 2, "bench_gains": 1}
-    calls = [
-        ast.unparse(node.func) for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)
-    ]
-    assert calls.count("GainEstimator") == others.get(path.stem, 0)
 
 
 def test_automatic_calibration_begins_with_the_same_estimator() -> None:
