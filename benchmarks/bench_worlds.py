@@ -74,7 +74,7 @@ SINGLE = {
     ),
     "radius": World("radius", contacts=ContactSpread(radius_sigma=Normal(0.0, 1.0))),
 }
-"""Worlds in which only some quantities are hidden, as those of earlier claims; contact patches as stated."""
+"""Worlds in which only some quantities are hidden; contact patches as stated."""
 WARM_UP = 12
 """Touches before those that are compared: as many as compensation of sheets needs for evidence."""
 HELD_SAMPLES, REST_SAMPLES, REST_PAUSES = 12, 6, 4

@@ -20,7 +20,7 @@ from page import OUT, keep_run_time, measured_commit
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
-    "diagnose", "worlds", "claims", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
+    "diagnose", "worlds", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
     "swap", "shear_slip", "estimate", "percept_grasp", "resolution", "shear", "design", "switched",
     "sheet",
 )  # fmt: skip
