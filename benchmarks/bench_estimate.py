@@ -1,4 +1,4 @@
-"""Measure location from noisy currents: against the Cramer-Rao bound, false alarms, resolution, and its cost.
+"""Measure location from noisy currents: against the Cramer-Rao bound, false alarms, and resolution.
 
 Prints its tables and writes docs/benchmarks/estimate.md, estimate.json and estimate.png.
 """
@@ -8,10 +8,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import statistics
-import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +21,6 @@ from scores import Estimates, EstimateScore, laplace_covariance
 
 from handtouch.field import (
     ElectrodeNetwork,
-    LocatorBank,
     Rectangle,
     point_test,
     resolvable_separation,
@@ -74,34 +69,31 @@ def bound(pad: ForwardModel, x: FloatArray, y: FloatArray, sigma: FloatArray) ->
 
 
 def efficiency(trials: int) -> list[dict[str, Any]]:
-    """Error of each contact in units of its own bound, and coverage, of `estimate` and of a bank."""
+    """Error of each contact in units of its own bound, and coverage."""
     rows = []
     for label, pad in PADS.items():
-        bank = LocatorBank([pad])
         for name, level in NOISES.items():
             sigma = np.broadcast_to(np.asarray(level, dtype=np.float64), (4,))
             x, y, currents = noisy(pad, sigma, trials, 1)
             least = bound(pad, x, y, sigma)
             bound_rms = np.sqrt(np.trace(least, axis1=1, axis2=2))
-            own = pad.estimate(currents, sigma[:, None])
-            banked = bank.estimate(np.zeros(trials, dtype=np.intp), currents, sigma[:, None])
+            found = pad.estimate(currents, sigma[:, None])
             row: dict[str, Any] = {
                 "pad": label,
                 "noise per total": name,
                 "bound, median of the shorter side": float(np.median(bound_rms) / min(pad.a, pad.b)),
             }
-            for method, found in (("estimate", own), ("bank", banked)):
-                error = np.stack([found.x - x, found.y - y], axis=1)
-                score = EstimateScore.of_estimates(
-                    Estimates(error, found.covariance[:, :2, :2], ~np.isnan(found.x), bound_rms, least)
-                )
-                row |= {
-                    f"{method}: error / bound, rms": score.ratio_rms,
-                    f"{method}: 50 / 95 / 99 %": " / ".join(f"{q:.3g}" for q in score.ratio_quantiles),
-                    f"{method}: in 95 %": str(score.coverage[0.95]),
-                    f"{method}: no location": score.valid.total - score.valid.count,
-                    f"{method}: not converged": float(1 - found.converged.mean()),
-                }
+            error = np.stack([found.x - x, found.y - y], axis=1)
+            score = EstimateScore.of_estimates(
+                Estimates(error, found.covariance[:, :2, :2], ~np.isnan(found.x), bound_rms, least)
+            )
+            row |= {
+                "error / bound, rms": score.ratio_rms,
+                "50 / 95 / 99 %": " / ".join(f"{q:.3g}" for q in score.ratio_quantiles),
+                "in 95 %": str(score.coverage[0.95]),
+                "no location": score.valid.total - score.valid.count,
+                "not converged": float(1 - found.converged.mean()),
+            }
             rows.append(row)
         progress(f"efficiency on a pad of {label}")
     return rows
@@ -122,47 +114,6 @@ def false_alarms(trials: int) -> list[dict[str, Any]]:
             row[f"at {rate:.0e}"] = f"{count / expected:.2f} +- {expected**-0.5:.2f}"
         progress(f"false alarms with noise {noise:g}")
         rows.append(row)
-    return rows
-
-
-def microseconds(call: Callable[[], Any]) -> float:
-    """Median processor time."""
-    samples = []
-    for _ in range(15):
-        begin = time.process_time()
-        for _ in range(100):
-            call()
-        samples.append((time.process_time() - begin) * 1e4)
-    return statistics.median(samples)
-
-
-def costs() -> list[dict[str, Any]]:
-    """A hand of 15 pads of six models in one call."""
-    sides = ((60, 34), (30, 30), (50, 20), (20, 20), (30, 20), (80, 60))
-    models = [ElectrodeNetwork(a * 1e-3, b * 1e-3, 5e-4, 2400.0) for a, b in sides]
-    begin = time.process_time()
-    bank = LocatorBank([models[i % 6] for i in range(15)])
-    built = time.process_time() - begin
-    rows = []
-    for noise in (1e-4, 1e-3):
-        generator = np.random.default_rng(2)
-        index = np.arange(15)
-        place = generator.uniform(0.1, 0.9, (2, 15)) * np.array(sides)[index % 6].T * 1e-3
-        fractions = bank.fractions(index, *place)
-        last, now = fractions + noise * generator.normal(size=(2, 4, 15))
-        found = bank.estimate(index, last, noise)
-        start = np.stack([found.x, found.y])
-        rows.append(
-            {
-                "noise": noise,
-                "build, s": built,
-                "table error": float(bank.table_error.max()),
-                "new contacts, us": microseconds(partial(bank.estimate, index, now, noise)),
-                "followed contacts, us": microseconds(partial(bank.estimate, index, now, noise, start)),
-                "fractions, us": microseconds(partial(bank.fractions, index, *place)),
-                "conformal radius, us": microseconds(partial(bank.conformal_radius, index, *place)),
-            }
-        )
     return rows
 
 
@@ -199,11 +150,6 @@ def main() -> None:
             "at 1e-2, up to 1.77:1. Each contact by its own bound; below one is possible: estimates stay on "
             "the pad, the bound does not.",
             efficiency(trials),
-        ),
-        "Cost for a hand of 15 pads": (
-            "Six models in one bank; medians of processor time. Aim: 250 us for new contacts, 120 us for "
-            "tracked ones.",
-            costs(),
         ),
         "False alarms of the test for a point": (
             "Counted over configured rate, with the scatter of counting. Pad 1.77:1, 5 % margin.",

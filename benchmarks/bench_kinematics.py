@@ -29,6 +29,7 @@ from handtouch.daemon.inputs import InputReceiver
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.wire.inputs import JointState, decode, encode
+from tests.exact_pads import ExactNetworks
 
 PERIOD_NS = 5_000_000
 JOINTS_EVERY_NS = 1_000_000
@@ -97,9 +98,9 @@ def measure(touched: int, ticks: int) -> list[dict[str, Any]]:
         robots = RobotModels(deployment.model_copy(update={"hands": (hand,)}))
         cases[name] = Case(model, robots, stated is not None, outputs)
     pads = np.arange(model.size)
-    x, y = (np.full((model.size, 2), 0.5) * model.locator.sides).T
+    exact = ExactNetworks(model)
     share = (
-        model.locator.fractions(pads, x, y).T
+        exact.fractions(pads, *(0.5 * exact.sides).T).T
         * (STRENGTH * model.begin_threshold_a[:, None])
         / model.ampere_per_count
     )

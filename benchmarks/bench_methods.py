@@ -18,12 +18,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tests.exact_pads import ExactPads
+
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
 import scipy
-from locators import LENGTH_MM, WAYS, WIDTH_MM, Locator, Setup
+from locators import CORE_PADS, LENGTH_MM, WAYS, WIDTH_MM, Locator, Setup
 from numpy.typing import NDArray
 from oracle import PadOracle
 from page import made_by, options, output_folder, table
@@ -141,12 +143,13 @@ def world_case(setup: Setup, pads: int, touches: int) -> Case:
     truth = [{record.link: record for record in hand.truth(t_s)} for t_s in times_s.tolist()]
     points = np.array([[by_link[pad.link].position_m for pad in entries] for by_link in truth])
     model, flat = setup.model, points.reshape(-1, 3)
+    exact = ExactPads(setup.deployment(CORE_PADS), model)
     currents = np.ascontiguousarray((counts * model.ampere_per_count[0]).reshape(-1, 4).T)
 
     def error_m(x: FloatArray, y: FloatArray) -> FloatArray:
         n = len(x)
-        placed = model.placement.to_link_frame(np.zeros(n, np.intp), x, y, np.zeros((n, 2, 2)))
-        return np.asarray(np.linalg.norm(placed.position_m - flat[:n], axis=1))
+        position_m = exact.position_m(np.zeros(n, np.intp), x, y)
+        return np.asarray(np.linalg.norm(position_m - flat[:n], axis=1))
 
     variance, noise = [], []
     for row, pad in enumerate(entries):

@@ -25,6 +25,7 @@ from handtouch.config.tables import SceneRequest
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
+from tests.exact_pads import ExactNetworks
 
 PERIOD_NS = 5_000_000
 SLIDING_M = 1e-4  # a tick: 20 mm/s at 200 Hz
@@ -95,17 +96,21 @@ class Slides:
     """Samples of contacts that slide over all pads and turn where the middle ends, with a count of noise."""
 
     def __init__(self, model: PadModel) -> None:
-        self._model, self._chance = model, np.random.default_rng(model.size)
+        self._model, self._exact, self._chance = (
+            model,
+            ExactNetworks(model),
+            np.random.default_rng(model.size),
+        )
         angle = self._chance.uniform(0, 2 * np.pi, model.size)
         self._place = self._chance.uniform(0.3, 0.7, (model.size, 2))
-        self._way = SLIDING_M * np.stack([np.cos(angle), np.sin(angle)], axis=1) / model.locator.sides
+        self._way = SLIDING_M * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._exact.sides
 
     def counts(self) -> Counts:
         model, pads = self._model, np.arange(self._model.size)
         self._place += self._way
         self._way[(self._place < 0.2) | (self._place > 0.8)] *= -1
-        x, y = (self._place * model.locator.sides).T
-        current = model.locator.fractions(pads, x, y).T * (CURRENT_RATIO * model.begin_threshold_a[:, None])
+        x, y = (self._place * self._exact.sides).T
+        current = self._exact.fractions(pads, x, y).T * (CURRENT_RATIO * model.begin_threshold_a[:, None])
         noise = self._chance.normal(size=(model.size, 4))
         return np.asarray(np.rint(current / model.ampere_per_count + noise), dtype="<i2")
 

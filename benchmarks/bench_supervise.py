@@ -43,6 +43,7 @@ from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.worlds import WORLDS, Family
+from tests.exact_pads import ExactNetworks
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -80,8 +81,8 @@ class Rig:
         self._climate = ElectronicsDrift(DRIFTS[world], names)
         self._zeros = np.zeros((0, model.size, 4))
         self._at = 0
-        pads = np.arange(model.size)
-        self.fractions = model.locator.fractions(pads, *(0.5 * model.locator.sides).T).T
+        exact = ExactNetworks(model)
+        self.fractions = exact.fractions(np.arange(model.size), *(0.5 * exact.sides).T).T
         self._up = np.zeros(model.size, np.uint8)
         self.t_ns = 10**9
 

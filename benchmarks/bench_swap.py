@@ -39,6 +39,7 @@ from handtouch.supervisor.ipc import (
 )
 from handtouch.supervisor.worker import SupervisorWorker
 from tests.deployments import deployment_text, pad_text
+from tests.exact_pads import ExactPads
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -130,15 +131,15 @@ def test_set(
     return counts.astype(np.float64), places
 
 
-def errors_mm(model: PadModel, counts: FloatArray, places: FloatArray) -> FloatArray:
+def errors_mm(exact: ExactPads, model: PadModel, counts: FloatArray, places: FloatArray) -> FloatArray:
     """Location errors (pads, 100) with the gains that the model has now."""
     found = []
     for pad in range(model.size):
         index = np.full(len(counts), pad)
         currents = (counts[:, pad] * model.ampere_per_count[pad]).T
-        at = model.locator.estimate(index, currents, model.noise_a[pad][:, None])
-        placed = model.placement.to_link_frame(index, at.x, at.y, np.zeros((index.size, 2, 2)))
-        found.append(1e3 * np.linalg.norm(placed.position_m - places[:, pad], axis=1))
+        at = exact.estimate(index, currents, model.noise_a[pad][:, None])
+        position_m = exact.position_m(index, at.x, at.y)
+        found.append(1e3 * np.linalg.norm(position_m - places[:, pad], axis=1))
     return np.array(found)
 
 
@@ -147,6 +148,7 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
     world = replace(WORLDS[name], mounts=MountSpread()).draw(Family.REPORTING.seed(5))
     deployment = world.describe(deployment_of(units))
     model = PadModel(deployment)
+    exact = ExactPads(deployment, model)
     hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
     readings, places = test_set(deployment, model, world)
     start = WorkerConfig(
@@ -172,13 +174,13 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                     covariance = np.reshape(word.covariance or (0.0,) * 16, (4, 4))
                     deviation[word.pad] = np.sqrt(np.diag(covariance).max())
             if number in counts:
-                taken[number] = errors_mm(model, readings, places), list(trust), deviation.copy()
+                taken[number] = errors_mm(exact, model, readings, places), list(trust), deviation.copy()
             if number < max(counts):
                 words = slow.process_message(block_of(hand, number, model.size), NOW)
         slow.finish(NOW)
     for pad, (hand_name, entry) in enumerate(hand.pads):
         model.set_gains_and_law(pad, 1 / np.array(world.pad(hand_name, entry).gain_ratio), "true")
-    least = errors_mm(model, readings, places)
+    least = errors_mm(exact, model, readings, places)
     rows = []
     for first, shape in enumerate(SHAPES):
         own = slice(first * units, (first + 1) * units)

@@ -26,6 +26,7 @@ from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
 from tests.core.shear_bench import PATTERNS, ShearBench
+from tests.exact_pads import ExactNetworks
 
 PADS = (15, 60, 240, 960)
 PARTS = (0.1, 1.0)
@@ -58,10 +59,10 @@ class Driver:
         self.cycle = Cycle(PERIOD_NS, 0.6)
         self._up = np.zeros(model.size, dtype=np.uint8)
         self._random = np.random.default_rng(model.size + touched)
-        self._sides = model.locator.sides
+        self._exact = ExactNetworks(model)
         self._position = self._random.uniform(0.3, 0.7, (model.size, 2))
         angle = self._random.uniform(0, 2 * np.pi, model.size)
-        self._velocity = sliding_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._sides
+        self._velocity = sliding_m * np.stack([np.cos(angle), np.sin(angle)], axis=1) / self._exact.sides
         self._t_ns = 10**9
 
     def sample(self) -> None:
@@ -70,9 +71,9 @@ class Driver:
         self._position += self._velocity
         self._velocity[(self._position < 0.2) | (self._position > 0.8)] *= -1
         pads = np.arange(self.touched)
-        at = self._position[pads] * self._sides[pads]
+        at = self._position[pads] * self._exact.sides[pads]
         counts = self._random.normal(size=(self.model.size, 4))
-        current = self.model.locator.fractions(pads, *at.T).T * (
+        current = self._exact.fractions(pads, *at.T).T * (
             CURRENT_RATIO * self.model.begin_threshold_a[pads, None]
         )
         counts[pads] += current / self.model.ampere_per_count[pads]

@@ -23,7 +23,7 @@ from skfem.models.poisson import laplace
 from handtouch import config
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.pad_model import PadModel
-from handtouch.field import ElectrodeNetwork, LocatorBank, Rectangle
+from handtouch.field import ElectrodeNetwork, Rectangle
 from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
 from handtouch.hand import electrode_network
 from tests.deployments import deployment_text, pad_text
@@ -109,16 +109,6 @@ def exact(setup: Setup) -> Locator:
 def likelihood(setup: Setup) -> Locator:
     def locate(currents: FloatArray) -> Position:
         found = setup.pad.estimate(currents, setup.noise_a)
-        return found.x, found.y
-
-    return locate
-
-
-def tabulated_likelihood(setup: Setup) -> Locator:
-    bank = LocatorBank([setup.pad])
-
-    def locate(currents: FloatArray) -> Position:
-        found = bank.estimate(np.zeros(currents.shape[1], dtype=np.intp), currents, setup.noise_a)
         return found.x, found.y
 
     return locate
@@ -277,7 +267,6 @@ WAYS: dict[str, Way] = {
     "ratio table": Way(ratio_table, "handtouch", ideal_only=True),
     "exact inverse": Way(exact, "handtouch"),
     "likelihood, exact field": Way(likelihood, "handtouch"),
-    "likelihood, numpy tables": Way(tabulated_likelihood, "handtouch"),
     "core, new contacts": Way(lambda setup: core(setup, tracked=False), "core"),
     "core, tracked contacts": Way(lambda setup: core(setup, tracked=True), "core"),
     "nearest of 1e5 samples": Way(nearest_neighbour, "instead"),

@@ -27,7 +27,6 @@ from page import made_by, options, output_folder
 from ratio_table import RatioTable
 
 from handtouch.field import (
-    LocatorBank,
     Rectangle,
     estimate,
     point_test,
@@ -203,7 +202,6 @@ def _sensitivity(f: list[Any], first: int, slope: list[Any]) -> Any:
 # Arguments of every kind
 
 PAD = Rectangle(1.5, 1.0)
-BANK = LocatorBank([PAD, Rectangle(0.7, 1.1)])
 TABLE, CORRECTED = RatioTable(PAD), LogRatioTable(PAD)
 Call = Callable[..., Any]
 
@@ -213,26 +211,17 @@ OF_PLACES: dict[str, Call] = {
     "conformal_radius": PAD.conformal_radius,
     "single_sum_fractions": lambda x, y: single_sum_fractions(PAD, x, y),
     "double_sum_fractions": lambda x, y: double_sum_fractions(PAD, x, y, terms=9),
-    "LocatorBank.fractions": lambda x, y: _in_bank(BANK.fractions, x, y),
-    "LocatorBank.conformal_radius": lambda x, y: _in_bank(BANK.conformal_radius, x, y),
     "resolvable_separation": lambda x, y: resolvable_separation(PAD, x, y, 1e-3),
 }
 OF_CURRENTS: dict[str, Call] = {
     "locate": lambda i: _columns(PAD.locate(i)),
     "estimate": lambda i: _columns(PAD.estimate(i, 1e-3)),
     "estimate, generic": lambda i: _columns(estimate(PAD, i, 1e-3)),
-    "LocatorBank.estimate": lambda i: _columns(BANK.estimate(np.zeros(np.shape(i)[1], dtype=int), i, 1e-3)),
     "RatioTable.locate": lambda i: np.stack(TABLE.locate(i)),
     "LogRatioTable.locate": lambda i: np.stack(CORRECTED.locate(i)),
     "log_ratio": lambda i: np.stack(log_ratio(PAD, i)),
     "point_test": lambda i: np.asarray(point_test(PAD, i, 1e-3).score),
 }
-
-
-def _in_bank(call: Call, x: Any, y: Any) -> FloatArray:
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-    found = call(np.zeros(x.size, dtype=int), x.ravel(), y.ravel())
-    return np.asarray(found).reshape(*np.shape(found)[:-1], *x.shape)
 
 
 def _columns(found: Any) -> FloatArray:
@@ -247,8 +236,7 @@ def arguments() -> Iterator[Row]:
     for name, call in OF_PLACES.items():
         yield _kinds(name, lambda p, call=call: call(p[0], p[1]), np.stack([x, y]))
     for name, call in OF_CURRENTS.items():
-        flat = currents.reshape(4, -1) if "Bank" in name else currents
-        yield _kinds(name, call, flat)
+        yield _kinds(name, call, currents)
 
 
 def _kinds(name: str, call: Call, given_: FloatArray) -> Row:
@@ -323,7 +311,7 @@ def _search_places(examples: int) -> Row:
 
 
 def _search_currents(examples: int) -> Row:
-    worst = Worst("locate, estimate, bank, tables", "any currents, any noise (hypothesis)", 0.5)
+    worst = Worst("locate, estimate, tables", "any currents, any noise (hypothesis)", 0.5)
 
     @settings(max_examples=examples, deadline=None, derandomize=True, database=None)
     @given(st.lists(anything, min_size=4, max_size=4), anything)
@@ -334,7 +322,6 @@ def _search_currents(examples: int) -> Row:
         for found in (
             PAD.locate(currents),
             PAD.estimate(currents, noise),
-            BANK.estimate(np.zeros(2, dtype=int), currents, noise),
         ):
             for coordinate, side in ((found.x, PAD.a), (found.y, PAD.b)):
                 off = ~(((coordinate >= 0) & (coordinate <= side)) | np.isnan(coordinate))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from handtouch.config import Deployment, parse
 from handtouch.core.pad_model import PadModel
 from tests.deployments import CYLINDER, deployment_text, pad_text
+from tests.exact_pads import ExactPads
 
 PADS = (
     pad_text("plane", 1, extra="mount = { position_mm = [10.0, 0.0, 5.0], rpy_deg = [0.0, 0.0, 90.0] }"),
@@ -24,16 +25,16 @@ TOLERANT_DEPLOYMENT = deployment_text(*PADS)
 
 @dataclass(frozen=True)
 class Bench:
-    """A deployment and its model."""
+    """A deployment, its model, and the exact theory."""
 
     deployment: Deployment
     model: PadModel
+    exact: ExactPads
 
     def counts(self, pad: int, x: float, y: float, current_a: float) -> NDArray[np.int16]:
         """Return the counts of a contact at (x, y), fractions of the pad's rectangle, with a current."""
-        side_a, side_b = self.model.locator.sides[pad]
-        at = np.array([pad]), np.array([x * side_a]), np.array([y * side_b])
-        fractions = self.model.locator.fractions(*at)[:, 0]
+        network = self.model.networks[pad]
+        fractions = network.fractions(x * network.a, y * network.b)
         counts: NDArray[np.int16] = np.rint(
             fractions * (current_a / self.model.ampere_per_count[pad])
         ).astype(np.int16)
@@ -43,4 +44,5 @@ class Bench:
 @pytest.fixture(scope="session")
 def bench() -> Bench:
     deployment = parse(DEPLOYMENT)
-    return Bench(deployment, PadModel(deployment))
+    model = PadModel(deployment)
+    return Bench(deployment, model, ExactPads(deployment, model))

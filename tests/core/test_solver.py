@@ -58,13 +58,12 @@ class Reference(NamedTuple):
     residual_std: FloatArray
 
     @classmethod
-    def solve(cls, model: PadModel, currents: FloatArray) -> Reference:
-        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
-        placed = model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
-        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale_m_per_unit
+    def solve(cls, bench: Any, currents: FloatArray) -> Reference:
+        found = bench.exact.estimate(PADS, currents.T, bench.model.noise_a.T)
+        placed = bench.exact.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
         std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        force = model.estimate_force(PADS, currents.T, found.total, std[:, 2], radius_m)
-        assert (force.status == ForceEstimateStatus.VALID).all()
+        forces = bench.exact.force(currents.T, found)
+        assert all(force.status == ForceEstimateStatus.VALID for force in forces)
         return cls(
             np.stack([found.x, found.y], axis=1),
             std[:, :2],
@@ -72,17 +71,17 @@ class Reference(NamedTuple):
             placed.normal,
             placed.pad_m,
             placed.covariance_m2 * (1 + np.fmax(found.chi_squared - 9, 0))[:, None, None],
-            force.force_n,
-            force.std_n,
+            np.array([float(force.force_n) for force in forces]),
+            np.array([float(force.std_n) for force in forces]),
             found.residual,
             np.abs(found.residual) / np.sqrt(np.maximum(found.chi_squared, 1e-300)),
         )
 
 
-def reading(model: PadModel, xy: FloatArray, total_a: float, rng: np.random.Generator | None) -> FloatArray:
+def reading(bench: Any, xy: FloatArray, total_a: float, rng: np.random.Generator | None) -> FloatArray:
     """Return currents (3, 4) of contacts at xy (3, 2), fractions of the sides."""
-    fractions = model.locator.fractions(PADS, *(xy * model.locator.sides).T).T
-    noise = model.noise_a * rng.normal(size=(3, 4)) if rng else 0.0
+    fractions = bench.exact.fractions(PADS, *(xy * bench.exact.sides).T).T
+    noise = bench.model.noise_a * rng.normal(size=(3, 4)) if rng else 0.0
     return np.asarray(total_a * fractions + noise)
 
 
@@ -90,8 +89,8 @@ def reading(model: PadModel, xy: FloatArray, total_a: float, rng: np.random.Gene
 @given(st.integers(0, 2**32 - 1), st.floats(3e-4, 3e-3))
 def test_a_contact_equals_its_reference(bench: Any, seed: int, total_a: float) -> None:
     rng = np.random.default_rng(seed)
-    currents = reading(bench.model, rng.uniform(0.15, 0.85, (3, 2)), total_a, rng)
-    contacts, expected = Contacts(bench.model), Reference.solve(bench.model, currents)
+    currents = reading(bench, rng.uniform(0.15, 0.85, (3, 2)), total_a, rng)
+    contacts, expected = Contacts(bench.model), Reference.solve(bench, currents)
     contacts.solve(currents)
     assert (np.abs(contacts.xy - expected.xy) < 0.02 * expected.xy_std + 1e-9).all()
     np.testing.assert_allclose(contacts.position_m, expected.position_m, atol=1e-7)
@@ -111,7 +110,7 @@ def test_a_contact_equals_its_reference(bench: Any, seed: int, total_a: float) -
 def test_normals_are_unit_and_covariances_singular_along_them(bench: Any, seed: int, total_a: float) -> None:
     rng = np.random.default_rng(seed)
     contacts = Contacts(bench.model)
-    contacts.solve(reading(bench.model, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng))
+    contacts.solve(reading(bench, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng))
     np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1, atol=1e-12)
     along = np.einsum("kij,kj->ki", contacts.covariance_m2, contacts.normal)
     trace = np.trace(contacts.covariance_m2, axis1=1, axis2=2)
@@ -124,7 +123,7 @@ def test_a_contact_that_jumps_or_changes_is_found_as_a_new_one_is(bench: Any, se
     rng = np.random.default_rng(seed)
     tracked = Contacts(bench.model)
     for total_a in 10 ** rng.uniform(-4.5, -2.5, 4):
-        currents = reading(bench.model, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng)
+        currents = reading(bench, rng.uniform(0.02, 0.98, (3, 2)), total_a, rng)
         tracked.solve(currents)
         new = Contacts(bench.model)
         new.solve(currents)
@@ -142,14 +141,14 @@ def test_a_contact_on_an_edge_or_corner_is_within_four_deviations_of_the_most_li
     contacts = Contacts(model)
     at = np.clip(np.full((3, 2), position), 0.02, 0.98)
     for _ in range(20):
-        currents = reading(model, at, 3e-4, rng)
+        currents = reading(bench, at, 3e-4, rng)
         contacts.solve(currents)
         for pad, network in enumerate(model.networks):
             own = estimate(network, currents[pad], model.noise_a[pad])
             assert (
                 misfit(model, pad, currents, contacts.xy[pad]) < own.chi_squared + 16
             )  # four standard deviations
-        assert ((contacts.xy >= 0) & (contacts.xy <= model.locator.sides)).all()
+        assert ((contacts.xy >= 0) & (contacts.xy <= bench.exact.sides)).all()
 
 
 def misfit(model: PadModel, pad: int, currents: FloatArray, xy: FloatArray) -> float:
@@ -165,7 +164,7 @@ def test_covariance_includes_the_uncertainty_of_gains(bench: Any) -> None:
     deviation, model = 0.02, copy.deepcopy(bench.model)
     model.set_uncertainty(0, deviation**2 * (np.eye(4) - 0.25), quarantined=False)
     contacts = Contacts(model)
-    straight = reading(model, np.full((3, 2), [0.4, 0.65]), 2e-3, None)
+    straight = reading(bench, np.full((3, 2), [0.4, 0.65]), 2e-3, None)
     contacts.solve(straight)
     stated, found = contacts.covariance_m2[0], []
     for logs in rng.normal(0, deviation, (1000, 4)):
@@ -179,7 +178,7 @@ def test_covariance_includes_the_uncertainty_of_gains(bench: Any) -> None:
 
 def test_a_force_that_is_not_requested_is_not_computed(bench: Any) -> None:
     contacts = Contacts(bench.model, force_requested=False)
-    contacts.solve(reading(bench.model, np.full((3, 2), 0.5), 2e-3, None))
+    contacts.solve(reading(bench, np.full((3, 2), 0.5), 2e-3, None))
     assert np.isfinite(contacts.xy).all()
     assert np.isnan(contacts.force_n).all()
     assert np.isnan(contacts.force_std_n).all()
@@ -191,21 +190,18 @@ def test_a_force_at_the_end_of_the_range_is_a_value_or_a_lower_bound(bench: Any)
     statuses = set()
     for number in range(600):
         position = 0.5 + 0.3 * np.sin(0.07 * number + np.arange(6).reshape(3, 2))
-        currents = reading(model, position, 8.5e-3 * (1 + 0.15 * np.sin(0.023 * number)), rng)
+        currents = reading(bench, position, 8.5e-3 * (1 + 0.15 * np.sin(0.023 * number)), rng)
         contacts.solve(currents)
-        found = model.locator.estimate(PADS, currents.T, model.noise_a.T)
-        placed = model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
-        radius_m = model.locator.conformal_radius(PADS, found.x, found.y) * placed.scale_m_per_unit
-        std = np.sqrt(found.covariance[:, 2, 2])
-        own = model.estimate_force(PADS, currents.T, found.total, std, radius_m)
-        statuses |= set(own.status.tolist())
+        forces = bench.exact.force(currents.T, bench.exact.estimate(PADS, currents.T, model.noise_a.T))
+        force_n, std_n, status = np.array([(one.force_n, one.std_n, one.status) for one in forces]).T
+        statuses |= set(status.tolist())
         bound = contacts.force_status == ForceEstimateStatus.LOWER_BOUND
-        same = bound == (own.status == ForceEstimateStatus.LOWER_BOUND)
+        same = bound == (status == ForceEstimateStatus.LOWER_BOUND)
         assert np.isinf(contacts.force_std_n[bound]).all()
         # where a hundredth of the factor is half of the force
-        assert (np.abs(np.log(contacts.force_n / own.force_n)) < 1.0)[same & bound].all()
-        clear = ~bound & (own.std_n < 0.3 * own.force_n)
-        assert (np.abs(contacts.force_n - own.force_n) < contacts.force_std_n)[clear].all()
+        assert (np.abs(np.log(contacts.force_n / force_n)) < 1.0)[same & bound].all()
+        clear = ~bound & (std_n < 0.3 * force_n)
+        assert (np.abs(contacts.force_n - force_n) < contacts.force_std_n)[clear].all()
     assert statuses == {ForceEstimateStatus.VALID, ForceEstimateStatus.LOWER_BOUND}
 
 
@@ -218,13 +214,12 @@ def test_the_covariance_of_an_extended_contact_covers_its_centre_of_force(bench:
         middle, apart = rng.uniform(0.3, 0.7, (3, 2)), rng.uniform(0.05, 0.2, (3, 1))
         angle = rng.uniform(0, np.pi, (3, 1))
         offset = apart * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
-        currents = reading(model, middle - offset, 1e-3, rng) + reading(model, middle + offset, 1e-3, rng)
+        currents = reading(bench, middle - offset, 1e-3, rng) + reading(bench, middle + offset, 1e-3, rng)
         contacts = Contacts(model)
         contacts.solve(currents)
-        zero = np.zeros((3, 2, 2))
-        true = model.placement.to_link_frame(PADS, *(middle * model.locator.sides).T, zero).position_m
-        point = model.locator.estimate(PADS, currents.T, model.noise_a.T).covariance[:, :2, :2]
-        narrow = model.placement.to_link_frame(PADS, *contacts.xy.T, point).covariance_m2
+        true = bench.exact.position_m(PADS, *(middle * bench.exact.sides).T)
+        point = bench.exact.estimate(PADS, currents.T, model.noise_a.T).covariance[:, :2, :2]
+        narrow = bench.exact.to_link_frame(PADS, *contacts.xy.T, point).covariance_m2
         for covariances, found in ((contacts.covariance_m2, inside), (narrow, as_a_point)):
             values, axes = np.linalg.eigh(covariances)
             along = np.einsum("kji,kj->ki", axes, contacts.position_m - true)[:, 1:]
@@ -237,10 +232,10 @@ def test_a_point_contact_has_the_covariance_of_its_noise(bench: Any) -> None:
     rng, equal = np.random.default_rng(7), []
     for _ in range(100):
         contacts = Contacts(bench.model)
-        currents = reading(bench.model, rng.uniform(0.2, 0.8, (3, 2)), 1e-3, rng)
+        currents = reading(bench, rng.uniform(0.2, 0.8, (3, 2)), 1e-3, rng)
         contacts.solve(currents)
-        found = bench.model.locator.estimate(PADS, currents.T, bench.model.noise_a.T)
-        placed = bench.model.placement.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
+        found = bench.exact.estimate(PADS, currents.T, bench.model.noise_a.T)
+        placed = bench.exact.to_link_frame(PADS, found.x, found.y, found.covariance[:, :2, :2])
         sizes = [
             np.trace(covariance, axis1=1, axis2=2)
             for covariance in (contacts.covariance_m2, placed.covariance_m2)

@@ -19,6 +19,7 @@ from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
 from tests.deployments import deployment_text, pad_text
+from tests.exact_pads import ExactPads
 
 FloatArray = NDArray[np.float64]
 RESISTED = 2
@@ -101,7 +102,7 @@ def test_learned_parts_replace_the_stated_tolerances(deployment: Deployment) -> 
     true = [other_network(deployment, 0, gaps_m, aspect), *learned.networks[1:]]
     at = np.full((3, 2), [0.25, 0.4])
     x, y = (at * sides(learned.networks)).T
-    exact = learned.placement.to_link_frame(np.arange(3), x, y, np.zeros((3, 2, 2))).position_m[0]
+    exact = ExactPads(deployment, learned).position_m(np.arange(3), x, y)[0]
     stated_error = np.linalg.norm(solve(learned, at, true)[1][0] - exact)
     variance, covariance = {}, matrix(1e-12 * np.eye(4 + len(stds)))
     for touch_error in (0.0, 3e-3):
@@ -202,10 +203,10 @@ def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Ge
         xy = rng.uniform(0.02, 0.98, (3, 2))
         covariance, position, normal = solve(model, xy, networks, gains, rng)
         x, y = (xy * sides(model.networks)).T
-        true = model.placement.to_link_frame(np.arange(3), x, y, np.zeros((3, 2, 2)))
+        true_m = ExactPads(deployment, model).position_m(np.arange(3), x, y)
         for row in range(3):
             tangents = np.linalg.svd(normal[row][None])[2][1:]
-            error = tangents @ (position[row] - true.position_m[row])
+            error = tangents @ (position[row] - true_m[row])
             found.append(error @ np.linalg.solve(tangents @ covariance[row] @ tangents.T, error))
     return np.array(found)
 
@@ -220,6 +221,7 @@ def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
     deployment = parse(deployment_text(pad_text("long", 1, long)))
     model, rng = PadModel(deployment), np.random.default_rng(2)
     currents, values, distances = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan), []
+    exact = ExactPads(deployment, model)
     solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
     for _ in range(25):
         network, gains = drawn_network(deployment, 0, rng), np.exp(rng.normal(0, 0.0115, 4))
@@ -232,7 +234,7 @@ def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
                 continue
             along = np.linalg.svd(values[:, VALUE_SLICES["normal"]])[2][1:]
             at = np.array([x * model.networks[0].a]), np.array([y * model.networks[0].b])
-            true = model.placement.to_link_frame(np.zeros(1, np.intp), *at, np.zeros((1, 2, 2))).position_m[0]
+            true = exact.position_m(np.zeros(1, np.intp), *at)[0]
             error = along @ (values[0, VALUE_SLICES["position_m"]] - true)
             covariance = along @ values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3) @ along.T
             distances.append(float(error @ np.linalg.solve(covariance, error)))

@@ -186,9 +186,7 @@ def test_pair_distance_follows_from_the_residual(bench: Any, residual: float, ax
     x, y = rig.pipeline.tick.columns.xy[PLANE].tolist()
     on_sheet, std = pair_distance(bench.model.networks[PLANE], x, y, residual, 1e-3)
     points = np.array([x, y]) + np.outer([-0.5, 0.5], np.eye(2)[axis]) * on_sheet
-    placed = bench.model.placement.to_link_frame(
-        np.full(2, PLANE), points[:, 0], points[:, 1], np.zeros((2, 2, 2))
-    ).position_m
+    placed = bench.exact.position_m(np.full(2, PLANE), points[:, 0], points[:, 1])
     distance_m, std_m = worker.pair_distance_m(PLANE, residual, 1e-3)
     assert distance_m == pytest.approx(float(np.linalg.norm(placed[1] - placed[0])), rel=1e-6)
     assert std_m == pytest.approx(std * distance_m / on_sheet)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from handtouch.field import (
     ForwardModel,
-    LocatorBank,
     Rectangle,
     estimate,
 )
@@ -152,10 +151,6 @@ def test_one_dimensional_noise_is_per_channel(contacts: int) -> None:
         alone = pad.estimate(currents[:, k], noise)
         np.testing.assert_allclose(found.x[k], alone.x, rtol=1e-9)
         np.testing.assert_allclose(found.covariance[k], alone.covariance, rtol=1e-6)
-    bank = LocatorBank([pad])
-    in_bank = bank.estimate(np.zeros(contacts, dtype=np.intp), currents, noise)
-    np.testing.assert_allclose(in_bank.x, found.x, atol=1e-5)
-    np.testing.assert_allclose(in_bank.covariance, found.covariance, rtol=1e-2, atol=1e-9)
 
 
 def test_no_positive_total_is_no_position() -> None:
@@ -174,5 +169,3 @@ def test_excluded_dead_channel_has_no_effect() -> None:
     noise = [1e-3, np.inf, 1e-3, 1e-3]
     found = pad.estimate(currents, noise)
     np.testing.assert_allclose([found.x, found.y], [0.4, 0.6], atol=1e-6)
-    in_bank = LocatorBank([pad]).estimate(np.zeros(1, dtype=np.intp), currents[:, None], noise)
-    np.testing.assert_allclose([in_bank.x[0], in_bank.y[0]], [0.4, 0.6], atol=1e-4)

@@ -79,14 +79,6 @@ def test_a_disc_and_a_cap_have_the_fractions_of_the_disc_they_are_mapped_from(
         assert pad.fractions(x, y).sum(axis=0) == pytest.approx(np.ones(100), abs=1e-12)
 
 
-def test_a_contact_on_a_mesh_is_located() -> None:
-    flat, triangles = disc(5)
-    pad = MeshNetwork(lifted(flat, 1.0), triangles, ends(1.0), SHEET)
-    found = pad.estimate(2e-3 * pad.fractions(0.7, 1.1), 1e-9)
-    assert (found.x, found.y) == pytest.approx((0.7, 1.1), abs=1e-3)
-    assert found.total == pytest.approx(2e-3, rel=1e-3)
-
-
 def strip() -> tuple[FloatArray, IntArray]:
     """Points and triangles of a rectangle of 2 by 1."""
     x, y = np.meshgrid(np.linspace(0, 2, 33), np.linspace(0, 1, 17), indexing="ij")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -253,51 +252,3 @@ def test_other_impossible_arguments_are_rejected() -> None:
         OutlineNetwork(Outline(L_SHAPE), [*two, BoundaryElectrode(0, 1, 1)], SHEET)
     with pytest.raises(ValueError, match="series_ohm must be 2"):
         OutlineNetwork(Outline(L_SHAPE), two, SHEET, (1.0,))
-
-
-@pytest.mark.parametrize("count", [3, 8])
-def test_estimates_have_their_covariance_and_n_less_3_degrees_of_freedom(count: int) -> None:
-    pad, sigma = disc(count), 1e-4
-    x, y = interior(pad, 80, 0.2)
-    noise = sigma * np.random.default_rng(5).normal(size=(count, x.size))
-    found = pad.estimate(pad.fractions(x, y) + noise, sigma)
-    off = np.stack([found.x - x, found.y - y, found.total - 1], axis=-1)
-    whitened = (off * np.linalg.solve(found.covariance, off[..., None])[..., 0]).sum(axis=-1)
-    # means of 80: standard deviations sqrt(2 dof / 80)
-    assert found.converged.all()
-    assert whitened.mean() == pytest.approx(3, abs=4 * math.sqrt(6 / 80))
-    assert found.chi_squared.mean() == pytest.approx(
-        count - 3, abs=4 * math.sqrt(2 * (count - 3) / 80) + 1e-6
-    )
-
-
-def test_an_estimate_is_exact_for_exact_currents_in_both_arms_of_an_l_shape() -> None:
-    pad = l_shape()
-    x, y = np.array([0.3, 1.6, 0.4, 0.95]), np.array([0.3, 0.4, 1.7, 0.9])
-    found = pad.estimate(3e-3 * pad.fractions(x, y), 1e-9)
-    assert found.x == pytest.approx(x, abs=1e-7)
-    assert found.y == pytest.approx(y, abs=1e-7)
-    assert found.total == pytest.approx(np.full(4, 3e-3), rel=1e-7)
-
-
-@pytest.mark.parametrize("make", [lambda: disc(4), l_shape], ids=["disc", "L"])
-def test_estimates_next_to_the_boundary_converge_to_the_best_of_a_search(
-    make: Callable[[], OutlineNetwork],
-) -> None:
-    pad, sigma, rng = make(), 3e-3, np.random.default_rng(1)
-    places = rng.uniform(0, pad.outline.perimeter(), 60)
-    away = max(pad.a, pad.b) * 10 ** rng.uniform(-4, -1.5, 60)
-    angle = rng.uniform(0, 2 * np.pi, 60)
-    edge = np.array([pad.outline.boundary_point(float(place)) for place in places]).T
-    x, y = edge + away * np.stack([np.cos(angle), np.sin(angle)])
-    inside = np.flatnonzero(pad.outline.contains(x, y))[:16]
-    currents = pad.fractions(x[inside], y[inside])
-    currents = currents + sigma * rng.normal(size=currents.shape)
-    found = pad.estimate(currents, sigma)
-    assert found.converged.all()
-    grid = np.stack(np.meshgrid(*(np.linspace(0.004, 0.997, 50),) * 2)).reshape(2, -1)
-    table = pad.fractions(pad.a * grid[0], pad.b * grid[1])
-    table = table[:, np.isfinite(table[0])]
-    along = np.maximum(table.T @ currents, 0.0) ** 2 / (table * table).sum(axis=0)[:, None]
-    least = ((currents * currents).sum(axis=0) - along.max(axis=0)) / sigma**2
-    assert (found.chi_squared < least + 1e-3).all()

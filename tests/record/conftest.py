@@ -61,9 +61,8 @@ class Hand:
     def counts(self, pad: int, x: float, y: float, current_a: float) -> bytes:
         """Return the PDO of a contact at (x, y), fractions of the rectangle, with a current."""
         model = self.pipeline.model
-        side_a, side_b = model.locator.sides[pad]
-        position = np.array([pad]), np.array([x * side_a]), np.array([y * side_b])
-        fractions = model.locator.fractions(*position)[:, 0]
+        network = model.networks[pad]
+        fractions = network.fractions(x * network.a, y * network.b)
         counts = fractions * (current_a / model.ampere_per_count[pad])
         return bytes(np.rint(counts).astype("<i2").tobytes())
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,8 +28,7 @@ from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.tolerances import PadTolerances, part_count
-from handtouch.field import LocatorBank
-from handtouch.field.contact_law import ContactLaw, ForceEstimate
+from handtouch.field.contact_law import ContactLaw
 from handtouch.field.contact_stack import stack_factor
 from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import (
@@ -78,8 +76,8 @@ class PadModel:
     modelled.
 
     `forward_tables` (those without an electrode where it is dead), `surface_tables` and `law_parameters` are
-    what the stages read; `weight` (n, c) is 1 / `noise_a`. `networks`, `placement` and `estimate_force` are
-    the exact theory that they tabulate.
+    what the stages read; `weight` (n, c) is 1 / `noise_a`. `networks` are the exact theory that the tables
+    approximate.
     """
 
     def __init__(
@@ -156,7 +154,6 @@ class PadModel:
         self.surface_tables = [
             SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
         ]
-        self.placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
         self._drive_v = np.array([node.drive_v for node in nodes])
         self._file_laws = [law_of(sheet) for sheet in sheets]
         self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
@@ -175,11 +172,6 @@ class PadModel:
             np.array([self.centre_current(pad, force[pad]) for pad in range(self.size)])
             for force in (self.begin_threshold_n, self.end_threshold_n)
         )
-
-    @cached_property
-    def locator(self) -> LocatorBank:
-        """Tables of the same forward models for offline use, built on first use; large, no part of a tick."""
-        return LocatorBank(self.networks)
 
     def default_calibration(self, pad: int) -> ActiveCalibration:
         """Return the calibration of a pad without one: the deployment's."""
@@ -326,36 +318,6 @@ class PadModel:
             for calibration, (before, after) in zip(calibrations, defaults, strict=True)
         ]
 
-    def estimate_force(
-        self,
-        index: NDArray[np.intp],
-        currents: FloatArray,
-        total_a: FloatArray,
-        total_std_a: FloatArray,
-        radius_m: FloatArray,
-    ) -> ForceEstimate:
-        """Estimate forces of contacts on the pads `index` (n,) from total currents and their standard
-        deviation.
-
-        `currents` (c, n), in any unit, and the spreading radius there identify the position.
-        """
-        series_ohm = self._series_resistance(index, currents)
-        found = [
-            self._laws[pad].force(
-                total_a[k],
-                self._drive_v[pad],
-                self._sheet_ohm[pad],
-                radius_m[k],
-                series_ohm[k],
-                current_std_a=total_std_a[k],
-            )
-            for k, pad in enumerate(index.tolist())
-        ]
-        force, std, status, radius = (
-            np.array([getattr(one, field.name) for one in found]) for field in fields(ForceEstimate)
-        )
-        return ForceEstimate(force, std, status, radius)
-
     def _series_resistance(self, index: NDArray[np.intp], currents: FloatArray) -> FloatArray:
         """Return the equivalent series resistance from contact to ground [ohm] (n,), sum of phi_i V_i / I."""
         if not self._has_series[index].any():
@@ -438,7 +400,8 @@ class PadModel:
         """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
-        scale = self.placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
+        placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad, _, _ in self._parts])
+        scale = placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
         radius = np.array([net.spreading_radius(*at) for net, *at in zip(networks, x, y, strict=True)])
         fractions = np.zeros((self.channels, self.size))
         fractions.T[self._used] = np.concatenate(

@@ -1,6 +1,5 @@
 """Potential theory of one resistive touch sensor: arrays in, arrays out; no I/O, no clock."""
 
-from handtouch.field.bank import LocatorBank
 from handtouch.field.contact_law import (
     ContactLaw,
     ForceEstimate,
@@ -16,7 +15,6 @@ from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.perimeter_network import PerimeterNetwork
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
-from handtouch.field.resolve import ContactShape, ResolvedContacts, ShapeEstimate, resolve_contacts
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
 from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import (
@@ -29,14 +27,12 @@ from handtouch.field.surface import (
     SphereSurface,
     Surface,
 )
-from handtouch.field.switched import SwitchedNetwork
 
 __all__ = [
     "AnisotropicSurface",
     "BoundaryElectrode",
     "ConeSurface",
     "ContactLaw",
-    "ContactShape",
     "CylinderSurface",
     "Electrode",
     "ElectrodeNetwork",
@@ -44,7 +40,6 @@ __all__ = [
     "ForceEstimateStatus",
     "ForwardModel",
     "Location",
-    "LocatorBank",
     "MeshNetwork",
     "Outline",
     "OutlineNetwork",
@@ -54,19 +49,15 @@ __all__ = [
     "PointTest",
     "PrismSurface",
     "Rectangle",
-    "ResolvedContacts",
     "RevolutionSurface",
     "Sandwich",
     "SandwichEstimate",
     "ScheduledNetwork",
-    "ShapeEstimate",
     "SphereSurface",
     "Surface",
-    "SwitchedNetwork",
     "contact_stack_resistance",
     "estimate",
     "point_test",
     "read_stl",
     "resolvable_separation",
-    "resolve_contacts",
 ]

@@ -13,8 +13,6 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field.estimate import PointEstimate, estimate
-
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -107,14 +105,6 @@ class GroundedElectrodes(ABC):
     def currents_per_ideal(self) -> FloatArray:
         """Matrix (m, m) from the fractions of directly grounded electrodes to those measured."""
         return self._mix
-
-    def estimate(
-        self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
-    ) -> PointEstimate:
-        """Return the maximum-likelihood contact from all noisy currents (m, ...); see
-        `handtouch.field.estimate`.
-        """
-        return estimate(self, currents, noise, start)
 
     @np.errstate(all="ignore")
     def _set_series_resistors(self, series_ohm: Sequence[float], count: int | None = None) -> None:

@@ -73,8 +73,7 @@ def estimate(
         `currents`. An infinite one leaves its channel out; one that is not positive gives NaN.
     start: (x, y), shape (2, ...), where to begin; found from the currents if absent.
 
-    Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises;
-    on an outline damped, along the boundary where it leads there, from several starts.
+    Gauss-Newton on (x, y) with the total eliminated (variable projection), halved until the likelihood rises.
     Raises ValueError if the first axis of `currents` is not the model's channels.
     """
     currents = np.asarray(currents, dtype=np.float64)
@@ -90,8 +89,7 @@ def estimate(
         # Currents and noise each in a unit of their own, so that squares stay in range.
         unit = np.ldexp(1.0, np.frexp(np.abs(flat).max(axis=0, initial=0.0))[1])
         exponent = np.frexp(sigma.min(axis=0, initial=np.inf))[1]
-        kind: type[LikelihoodFit] = getattr(model, "likelihood_fit", LikelihoodFit)
-        fit = kind(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
+        fit = LikelihoodFit(model, flat / unit, np.ldexp(sigma, -exponent), np.ldexp(1.0, exponent) / unit)
         if start is None:
             begin = None
         else:

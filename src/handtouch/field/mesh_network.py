@@ -11,15 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._outline_fit import OutlineFit
 from handtouch.field._series_resistors import GroundedElectrodes
-from handtouch.field.model import MIN_INSET, FloatArray, PadBoundary
-from handtouch.field.outline import BoolArray, ComplexArray
+from handtouch.field.model import FloatArray
 
 IntArray = npt.NDArray[np.intp]
 Point3 = tuple[float, float, float]
@@ -68,8 +65,6 @@ class MeshNetwork(GroundedElectrodes):
     for impossible resistances.
     """
 
-    likelihood_fit: ClassVar = OutlineFit
-
     def __init__(
         self,
         vertices: npt.ArrayLike,
@@ -100,7 +95,6 @@ class MeshNetwork(GroundedElectrodes):
         self._potentials, self._conductance = 2 * values - between, 2 * conductance - coarse_conductance
         self._potentials[marks >= 0] = values[marks >= 0]
         self._points, self._triangles = fine, divided
-        self._edge = points[ring, 0] + 1j * points[ring, 1]
         flat = fine[divided][:, :, :2]
         self._corner = flat[:, 0]
         self._inverse = np.linalg.inv((flat[:, 1:] - flat[:, :1]).swapaxes(1, 2))
@@ -131,32 +125,6 @@ class MeshNetwork(GroundedElectrodes):
         """Return `fractions` (m, ...) and derivatives by (x, y) (m, 2, ...), constant in each triangle."""
         values, jacobian = self._ideal_with_jacobian(x, y)
         return self._mixed(values), self._mixed(jacobian)
-
-    def project_inside(self, x: FloatArray, y: FloatArray) -> PadBoundary:
-        """Return points (n,), moved to the edge where off the pad, with the edge nearest to them."""
-        z = np.asarray(x + 1j * y)
-        inset = MIN_INSET * max(self.a, self.b)
-        start, step = self._edge, np.roll(self._edge, -1) - self._edge
-        along = np.clip(((z[:, None] - start) / step).real, 0, 1)
-        foot = start + along * step
-        nearest = np.abs(foot - z[:, None]).argmin(axis=1)
-        foot = np.take_along_axis(foot, nearest[:, None], axis=1)[:, 0]
-        normal = (1j * step / np.abs(step))[nearest]
-        distance = np.abs(foot - z)
-        off = ~(self._contains(z) & (distance >= inset))
-        moved = np.where(off, foot + inset * normal, z)
-        moved[off & ~self._contains(moved)] = np.nan
-        distance = np.where(off, inset, distance)
-        return PadBoundary(moved.real, moved.imag, normal.real, normal.imag, distance)
-
-    def boundary_points(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return x and y of about `count` points next to the edge."""
-        some = self._edge[:: max(1, len(self._edge) // count)]
-        found = self.project_inside(some.real, some.imag)
-        return found.x, found.y
-
-    def _contains(self, z: ComplexArray) -> BoolArray:
-        return np.asarray(np.isfinite(self._located(z.real, z.imag)[0][0]))
 
     def _located(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, IntArray]:
         """Return barycentric coordinates (3, n), NaN off the pad, and triangles (n,)."""

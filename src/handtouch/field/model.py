@@ -1,16 +1,13 @@
-"""Interface of forward models: estimators and banks work with any pad that implements it."""
+"""Interface of forward models: estimators and tables work with any pad that implements it."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-
-MIN_INSET = 1e-6
-"""Least distance from the boundary of points that are moved there, of the larger extent."""
 
 
 class FractionModel(Protocol):
@@ -55,30 +52,6 @@ def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> Float
     """
     radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
     return np.asarray(radius(x, y), dtype=np.float64)
-
-
-def move_inside(model: FractionModel, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return points (n,), where off the pad replaced by the nearest on it; NaN where none was found."""
-    project = getattr(getattr(model, "network", model), "project_inside", None)
-    if project is not None:
-        found: PadBoundary = project(x, y)
-        return found.x, found.y
-    inset = MIN_INSET * max(model.a, model.b)
-    return np.clip(x, inset, model.a - inset), np.clip(y, inset, model.b - inset)
-
-
-class PadBoundary(NamedTuple):
-    """Points of a pad and the boundary nearest to them, all (n,), in the unit of the pad.
-
-    x, y: on the pad, at least a small distance from its boundary; NaN where none was found. normal_x,
-    normal_y: inward unit normal of the nearest boundary. distance: from it.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    normal_x: FloatArray
-    normal_y: FloatArray
-    distance: FloatArray
 
 
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

@@ -298,31 +298,6 @@ class Outline:
         index = int(np.argmin([abs(e.point(s) - z)[0] for e, s in zip(edges, near, strict=True)]))
         return math.fsum(e.length for e in edges[:index]) + float(edges[index].length_to(near[index])[0])
 
-    def project_inside(
-        self, x: FloatArray, y: FloatArray, inset: float
-    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-        """Return points (n,) as complex numbers, those outside or nearer than `inset` moved to that distance
-        from the boundary; the inward unit normals there as complex numbers, and the distances.
-
-        NaN where no such point was found, as in a sharp corner.
-        """
-        z = x + 1j * y
-        best = np.full(z.shape, np.inf)
-        foot, normal = np.array(z), np.zeros(z.shape, np.complex128)
-        for edges, sign in zip(self.contours, self.signs, strict=True):
-            for edge in edges:
-                s = edge.nearest_parameter(z)
-                at, slope = edge.point(s), edge.derivative(s)
-                distance = np.abs(at - z)
-                closer = distance < best
-                best[closer], foot[closer] = distance[closer], at[closer]
-                normal[closer] = (sign * 1j * slope / np.abs(slope))[closer]
-        off = np.flatnonzero(~(self.contains(z.real, z.imag) & (best >= inset)))
-        z[off], best[off] = (foot + inset * normal)[off], inset
-        outside = off[~self.contains(z[off].real, z[off].imag)]
-        z[outside] = np.nan
-        return z, normal, best
-
     def locate_position(self, position: float, contour: int = 0) -> tuple[int, float]:
         """Return edge and parameter at a position; raises ValueError if it is off the contour."""
         if not 0 <= contour < len(self.contours):

@@ -13,16 +13,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from handtouch.field._boundary_panels import Stretch, initial_panels
 from handtouch.field._mixed_problem import MixedProblem
-from handtouch.field._outline_fit import OutlineFit
 from handtouch.field._series_resistors import GroundedElectrodes
-from handtouch.field.model import MIN_INSET, PadBoundary
 from handtouch.field.outline import MIN_CLEARANCE, ComplexArray, FloatArray, Outline
 
 _SMOOTH_ANGLE_RAD = 1e-9
@@ -71,8 +68,6 @@ class OutlineNetwork(GroundedElectrodes):
     shorter than 1e-4 of the larger extent, impossible resistances, and outlines that need more than 6,000
     unknowns.
     """
-
-    likelihood_fit: ClassVar = OutlineFit
 
     def __init__(
         self,
@@ -185,23 +180,6 @@ class OutlineNetwork(GroundedElectrodes):
         image, sign = self._mirror_images(z[inside])
         values[inside] = np.exp(self._problem.log_spread(z[inside], image, sign))
         return values.reshape(shape) * (self._unit * 2 / (1 + self._stretch))
-
-    def project_inside(self, x: FloatArray, y: FloatArray) -> PadBoundary:
-        """Return points (n,), moved to the boundary where off the pad, with the boundary nearest to them."""
-        z, normal, distance = self.outline.project_inside(x, y, MIN_INSET * max(self._extent))
-        return PadBoundary(z.real, z.imag, normal.real, normal.imag, distance)
-
-    def boundary_points(self, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return x and y of about `count` points of the pad next to its boundary, evenly spaced."""
-        total = sum(self.outline.perimeter(contour) for contour in range(len(self.outline.contours)))
-        points = []
-        for contour in range(len(self.outline.contours)):
-            length = self.outline.perimeter(contour)
-            own = max(4, round(count * length / total))
-            places = (np.arange(own) + 0.5) * length / own
-            points += [self.outline.boundary_point(float(place), contour) for place in places]
-        found = self.project_inside(*np.array(points).T)
-        return found.x, found.y
 
     def _points(
         self, x: npt.ArrayLike, y: npt.ArrayLike

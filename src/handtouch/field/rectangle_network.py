@@ -11,6 +11,7 @@ from typing import NamedTuple, Self
 import numpy.typing as npt
 
 from handtouch.field._series_resistors import FloatArray, GroundedElectrodes
+from handtouch.field.estimate import PointEstimate, estimate
 
 
 class ElectrodeEnd(NamedTuple):
@@ -23,6 +24,14 @@ class ElectrodeEnd(NamedTuple):
 
 class RectangleNetwork(GroundedElectrodes):
     """A resistive rectangle [0, a] x [0, b] with m electrodes on its boundary; a `ForwardModel`."""
+
+    def estimate(
+        self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
+    ) -> PointEstimate:
+        """Return the maximum-likelihood contact from all noisy currents (m, ...); see
+        `handtouch.field.estimate`.
+        """
+        return estimate(self, currents, noise, start)
 
     @property
     @abstractmethod
