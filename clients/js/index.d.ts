@@ -15,6 +15,9 @@ export class WireError extends Error {}
 /** A pad isn't sampled, so that nobody knows whether it is touched; the text has link, state and age. */
 export class NotSampledError extends Error {}
 
+/** The daemon has no such hand; the text names those that it has. */
+export class UnknownNameError extends Error {}
+
 /** A loop over the frames of a daemon that is gone, or was restarted. */
 export class DisconnectedError extends Error {}
 

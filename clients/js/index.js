@@ -10,11 +10,15 @@ const QUEUE_MESSAGES = 10_000;
 const SERVICE_TIMEOUT_NS = 1_500_000_000n;
 const MIN_AGE_NS = 50_000_000n;
 const MAX_DRIFT_PPM = 500n;
+const SILENCE_MS = 2000; // without any message: a warning
 const POLL_MS = 20;
 const LOCAL = /^(ipc:\/\/|inproc:\/\/|tcp:\/\/(127\.|localhost|\[::1\]))/;
 const nowNs = () => process.hrtime.bigint(); // CLOCK_MONOTONIC, the clock of t_ns on the daemon's machine
 const max = (a, b) => (a > b ? a : b);
 const min = (a, b) => (a < b ? a : b);
+
+/** The daemon has no such hand; the text names those that it has. */
+export class UnknownNameError extends Error {}
 
 /** A loop over the frames of a daemon that is gone, or was restarted. */
 export class DisconnectedError extends Error {}
@@ -114,8 +118,15 @@ export class Hand {
   #clockSession = null;
   #seen = null;
   #failure = null;
+  #name;
+  #unknown = "";
+  #warning;
 
   constructor(name, { endpoint = "tcp://127.0.0.1:5580", key, maxAgeMs } = {}) {
+    this.#name = name;
+    this.#warning = setTimeout(() => {
+      if (this.#received === 0) console.warn(`handtouch: no daemon at ${endpoint}; start \`handtouch run FILE\``);
+    }, SILENCE_MS).unref();
     this.#maxAgeNs = maxAgeMs === undefined ? null : BigInt(Math.round(1e6 * maxAgeMs));
     this.#isLocal = LOCAL.test(endpoint);
     this.#frameTopic = `hand/${name}`;
@@ -146,7 +157,8 @@ export class Hand {
 
   /**
    * The newest frame that has arrived; null before the first, without a daemon, and while the newest is older
-   * than maxAgeMs by its own time. Doesn't wait.
+   * than maxAgeMs by its own time. Doesn't wait. Throws UnknownNameError while the daemon has no such hand.
+   * Nothing received for 2 s is logged once.
    */
   async latest() {
     // #receive takes what arrived while the program computed in the next turns of the event loop; reading
@@ -215,6 +227,7 @@ export class Hand {
   }
 
   close() {
+    clearTimeout(this.#warning);
     this.#socket.close();
     this.#wake();
   }
@@ -246,7 +259,9 @@ export class Hand {
 
   #current() {
     if (this.#failure !== null) throw this.#failure;
-    return this.alive ? this.#state.frame : null;
+    const frame = this.alive ? this.#state.frame : null;
+    if (this.#unknown !== "") throw new UnknownNameError(this.#unknown);
+    return frame;
   }
 
   // Now on the daemon's clock; on another machine the least that it may be, by the smallest delay seen, which
@@ -285,7 +300,7 @@ export class Hand {
       if (topic === this.#frameTopic || topic === "service") {
         const message = topic === "service" ? decodeService(payload) : decodeFrame(payload);
         const before = this.#state.frame;
-        if (topic === "service") this.#state.feedService(message, order);
+        if (topic === "service") this.#feedService(message, order);
         else this.#state.feedFrame(message, order);
         if (this.#state.frame !== before) this.#frameNs = receivedNs;
         return this.#observe(message, receivedNs);
@@ -297,6 +312,13 @@ export class Hand {
       if (!(error instanceof WireError)) throw error;
       this.malformedMessages += 1;
     }
+  }
+
+  #feedService(service, order) {
+    this.#state.feedService(service, order);
+    const hands = Object.keys(service.hands);
+    const isKnown = hands.includes(this.#name);
+    this.#unknown = isKnown ? "" : `the daemon has no hand '${this.#name}'; it has ${hands.join(", ")}`;
   }
 
   #nextMessage(timeoutMs) {

@@ -12,17 +12,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from handtouch.client import Subscriber, columns, connect, request
+    from handtouch.client import Subscriber, UnknownNameError, columns, connect, request
     from handtouch.client.control import DaemonControl
     from handtouch.client.hand import Hand
+    from handtouch.client.link_columns import NotSampledError
     from handtouch.client.robot import Robot
 
 __version__ = "0.1.0"
 _MODULES = {
     "DaemonControl": "handtouch.client.control",
     "Hand": "handtouch.client.hand",
+    "NotSampledError": "handtouch.client.link_columns",
     "Robot": "handtouch.client.robot",
     "Subscriber": "handtouch.client",
+    "UnknownNameError": "handtouch.client",
     "columns": "handtouch.client",
     "connect": "handtouch.client",
     "request": "handtouch.client",
@@ -30,8 +33,10 @@ _MODULES = {
 __all__ = [
     "DaemonControl",
     "Hand",
+    "NotSampledError",
     "Robot",
     "Subscriber",
+    "UnknownNameError",
     "__version__",
     "columns",
     "connect",

@@ -93,7 +93,7 @@ def test_status_without_a_daemon_exits_with_status_1_and_a_remedy(
     endpoints: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["status", "--endpoint", endpoints["control"]]) == 1
-    assert "check that `handtouch run` is running" in capsys.readouterr().err
+    assert "start `handtouch run FILE`" in capsys.readouterr().err
 
 
 def test_watch_with_an_unknown_topic_exits_with_status_2(capsys: pytest.CaptureFixture[str]) -> None:

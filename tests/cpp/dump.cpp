@@ -3,6 +3,7 @@
 //     dump all ENDPOINT COUNT     every contact and hand message, until so many have come
 //     dump newest ENDPOINT COUNT  newest frames of the hand `right`, and the contacts with each
 //     dump ages ENDPOINT COUNT    after a line of input, the ages of so many newest frames, or "none"
+//     dump unknown ENDPOINT       the error of a hand that the daemon doesn't have
 //     dump touched                for each line of hexadecimal digits whether the first pad is touched
 //     dump decode                 for each line of hexadecimal digits "ok" or "refused"
 #include <handtouch/hand.hpp>
@@ -202,6 +203,15 @@ void dump_ages(const char* endpoint, int count) {
     }
 }
 
+void dump_unknown(const char* endpoint) {
+    handtouch::Hand hand("rigth", endpoint);
+    try {
+        hand.wait(std::chrono::seconds(60));
+    } catch (const handtouch::UnknownNameError& error) {
+        std::puts(error.what());
+    }
+}
+
 void dump_touched() {
     for (std::string line; std::getline(std::cin, line);) {
         std::string bytes;
@@ -236,6 +246,7 @@ int main(int argc, char** argv) {
     if (mode == "all" && argc == 4) dump_all(argv[2], std::atoi(argv[3]));
     else if (mode == "newest" && argc == 4) dump_newest(argv[2], std::atoi(argv[3]));
     else if (mode == "ages" && argc == 4) dump_ages(argv[2], std::atoi(argv[3]));
+    else if (mode == "unknown" && argc == 3) dump_unknown(argv[2]);
     else if (mode == "touched") dump_touched();
     else if (mode == "decode") dump_decoded();
     else return 2;

@@ -19,7 +19,7 @@ import pytest
 
 from handtouch import wire
 from handtouch.client import columns, connect
-from tests.client.hand_messages import LINKS, make_contact, make_frame
+from tests.client.hand_messages import LINKS, make_contact, make_frame, make_service
 
 LONGEST_S = 120.0
 MESSAGES = 10_000
@@ -268,6 +268,28 @@ def test_no_frame_is_old_after_the_daemon_hung_or_ended_while_the_program_comput
     assert len(lines) == 100
     assert all(line["kind"] == "none" or line["age_s"] < 0.1 for line in lines)
     assert lines[-1]["kind"] == "none"
+
+
+@pytest.mark.parametrize("program", LANGUAGES, indirect=True)
+def test_an_unknown_hand_is_an_error_that_names_those_of_the_daemon(
+    program: list[str], start: Start, publisher: Any, endpoints: dict[str, str]
+) -> None:
+    reader = start(program, "unknown", endpoints["live"])
+    for _ in range(3):
+        assert publisher.poll(1000 * LONGEST_S)
+        publisher.recv()
+    publisher.send_multipart(wire.encode(make_service(hands={"right": [], "left": []})))
+    assert reader.communicate(timeout=LONGEST_S)[0] == "the daemon has no hand 'rigth'; it has right, left\n"
+
+
+@pytest.mark.parametrize("program", LANGUAGES, indirect=True)
+def test_the_absence_of_a_daemon_is_logged(program: list[str], endpoints: dict[str, str]) -> None:
+    command = [*program, "newest", endpoints["live"], "1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as reader:
+        assert reader.stderr is not None
+        line = reader.stderr.readline()
+        reader.kill()
+    assert line == f"handtouch: no daemon at {endpoints['live']}; start `handtouch run FILE`\n"
 
 
 @pytest.mark.parametrize("program", LANGUAGES, indirect=True)

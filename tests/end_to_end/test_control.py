@@ -271,7 +271,7 @@ def test_commands_report_a_missing_daemon(tmp_path: Path) -> None:
     ]
     for process in asking:  # side by side: each waits for an answer
         _, output = process.communicate(timeout=LONGEST_S)
-        assert (process.returncode, "check that `handtouch run` is running" in output) == (1, True)
+        assert (process.returncode, "start `handtouch run FILE`" in output) == (1, True)
 
 
 def test_every_request_prints_json(served: Served, capsys: pytest.CaptureFixture[str]) -> None:

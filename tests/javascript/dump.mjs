@@ -3,12 +3,13 @@
 //     node dump.mjs all ENDPOINT COUNT     every contact and hand message, until so many have come
 //     node dump.mjs newest ENDPOINT COUNT  newest frames of the hand `right`, and the contacts with each
 //     node dump.mjs ages ENDPOINT COUNT    after a line of input, the ages of so many newest frames, or "none"
+//     node dump.mjs unknown ENDPOINT       the error of a hand that the daemon doesn't have
 //     node dump.mjs touched                for each line of hexadecimal digits whether the first pad is touched
 //     node dump.mjs decode                 for each line of hexadecimal digits "ok" or "refused"
 import { readSync } from "node:fs";
 import { createInterface } from "node:readline";
 
-import { Hand, NotSampledError, WireError, decodeContact, decodeFrame } from "handtouch";
+import { Hand, NotSampledError, UnknownNameError, WireError, decodeContact, decodeFrame } from "handtouch";
 import { Subscriber } from "zeromq";
 
 // an integer beyond 2^53 is printed as text; JSON.stringify makes null of NaN
@@ -57,6 +58,15 @@ async function ages(endpoint, count) {
   hand.close();
 }
 
+async function unknown(endpoint) {
+  const hand = new Hand("rigth", { endpoint });
+  await hand.wait(60_000).catch((error) => {
+    if (!(error instanceof UnknownNameError)) throw error;
+    console.log(error.message);
+  });
+  hand.close();
+}
+
 async function touchedLines() {
   for await (const line of createInterface({ input: process.stdin })) {
     const frame = decodeFrame(Buffer.from(line, "hex"));
@@ -82,4 +92,4 @@ async function decodeLines() {
 }
 
 const [mode, endpoint, count] = process.argv.slice(2);
-await { all, newest, ages, touched: touchedLines, decode: decodeLines }[mode](endpoint, Number(count));
+await { all, newest, ages, unknown, touched: touchedLines, decode: decodeLines }[mode](endpoint, Number(count));

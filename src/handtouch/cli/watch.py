@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 
 from handtouch.cli.options import LIVE_HELP, add_endpoint, positive_number
-from handtouch.client import connect
+from handtouch.client import UnknownNameError, connect
 from handtouch.host.endpoints import LIVE_ENDPOINT
 from handtouch.view.displays import Display, LineDisplay, LiveDisplay, show_messages
 
@@ -64,9 +64,9 @@ def run(
             has_received = messages.has_received
     except KeyboardInterrupt:  # the usual end
         return 0
-    except PermissionError as error:
+    except (PermissionError, UnknownNameError) as error:
         print(error, file=sys.stderr)
         return 1
     if not has_received:
-        print(f"no message from {endpoint}; check that `handtouch run` is running", file=sys.stderr)
+        print(messages.connection.reason_of_silence, file=sys.stderr)
     return 0 if has_received else 1

@@ -3,6 +3,7 @@
 from handtouch.client.subscriber import (
     SERVICE_TIMEOUT_S,
     Subscriber,
+    UnknownNameError,
     columns,
     connect,
     request,
@@ -14,6 +15,7 @@ __all__ = [
     "LIVE_ENDPOINT",
     "SERVICE_TIMEOUT_S",
     "Subscriber",
+    "UnknownNameError",
     "columns",
     "connect",
     "request",

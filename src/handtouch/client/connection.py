@@ -6,8 +6,11 @@ Public names: `Connection`.
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
+import time
 from collections.abc import Mapping
+from math import ceil
 from pathlib import Path
 from typing import Self
 
@@ -15,6 +18,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from handtouch.client.keys import ClientKey, load_client
+from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
 _HANDSHAKE_EVENTS = (
     zmq.Event.HANDSHAKE_SUCCEEDED
@@ -23,6 +27,9 @@ _HANDSHAKE_EVENTS = (
     | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
 )
 _EVENTS = _HANDSHAKE_EVENTS | zmq.Event.DISCONNECTED
+SILENCE_S = 2.0
+"""Time without any message after which a subscription logs why; `service` comes four times in it"""
+_log = logging.getLogger("handtouch.client")
 _MAX_HANDSHAKE_FAILURES = 3
 """Consecutive failed handshakes that are put down to a daemon that restarts."""
 KEEPALIVE_OPTIONS: Mapping[int, int] = {
@@ -62,6 +69,9 @@ class Connection:
         self.disconnects = 0
         """times that the connection was lost, as noticed by `poll` and `check`"""
         self._failures = 0
+        self._is_open = self._is_refused = False
+        """after the handshake; closed by the other side before it"""
+        self._warn_at_s = time.monotonic() + SILENCE_S if socket.type == zmq.SUB else float("inf")
         self._waiting: set[asyncio.Future[None]] = set()
         self._poller = zmq.Poller()
         self._poller.register(socket, zmq.POLLIN)
@@ -103,10 +113,41 @@ class Connection:
 
         Raises PermissionError when the daemon rejects this client.
         """
-        ready = {socket for socket, _ in self._poller.poll(wait_ms)}
-        if self._monitor in ready and self.socket not in ready:  # what it sent before comes first
-            self.check()
-        return bool(ready)
+        end_s = float("inf") if wait_ms is None else time.monotonic() + 1e-3 * wait_ms
+        while True:
+            until_s = min(end_s, self._warn_at_s)
+            left_ms = None if until_s == float("inf") else max(0, ceil(1e3 * (until_s - time.monotonic())))
+            ready = {socket for socket, _ in self._poller.poll(left_ms)}
+            if self._monitor in ready and self.socket not in ready:  # what it sent before comes first
+                self.check()
+            self.warn_of_silence()
+            if ready or until_s == end_s:
+                return bool(ready)
+
+    def note_message(self) -> None:
+        """Note that a message was received, so that silence needs no warning."""
+        self._warn_at_s = float("inf")
+
+    def warn_of_silence(self) -> None:
+        """Log once that no message has come, and why, where a subscription is SILENCE_S old."""
+        if time.monotonic() >= self._warn_at_s and not self.readable:
+            self._warn_at_s = float("inf")
+            _log.warning("%s", self.reason_of_silence)
+
+    @property
+    def reason_of_silence(self) -> str:
+        """Why nothing is received, with a remedy."""
+        if self._is_refused and self.socket.type == zmq.SUB:
+            return (
+                f"{self.endpoint} is no stream of messages, perhaps a control endpoint; "
+                f"the live stream is by default {LIVE_ENDPOINT}"
+            )
+        if self._is_refused:
+            return (
+                f"{self.endpoint} takes no requests, perhaps it is a stream of messages; "
+                f"the control endpoint is by default {CONTROL_ENDPOINT}"
+            )
+        return f"no daemon at {self.endpoint}; start `handtouch run FILE`"
 
     def check(self) -> None:
         """Count disconnections that have happened. Raises PermissionError when the daemon rejects us."""
@@ -136,6 +177,8 @@ class Connection:
             raise
         loop = asyncio.get_running_loop()
         woken: asyncio.Future[None] = loop.create_future()
+        left_s = self._warn_at_s - time.monotonic()
+        timer = loop.call_later(left_s, self.warn_of_silence) if left_s < float("inf") else None
         if not self._waiting:
             for descriptor in self._descriptors():
                 loop.add_reader(descriptor, self.wake_waiting)
@@ -143,6 +186,8 @@ class Connection:
         try:
             await woken
         finally:
+            if timer is not None:
+                timer.cancel()
             self._waiting.discard(woken)
             if not self._waiting:
                 for descriptor in self._descriptors():
@@ -172,7 +217,11 @@ class Connection:
         event = parse_monitor_message(parts)["event"]
         if event == zmq.Event.DISCONNECTED:
             self.disconnects += 1
+            # a socket of another type closes the connection without a failed handshake
+            self._is_refused = not self._is_open and self._failures == 0
+            self._is_open = False
             return
+        self._is_open = event == zmq.Event.HANDSHAKE_SUCCEEDED
         self._failures = 0 if event == zmq.Event.HANDSHAKE_SUCCEEDED else self._failures + 1
         if event == zmq.Event.HANDSHAKE_FAILED_AUTH and self._key is not None:
             raise PermissionError(

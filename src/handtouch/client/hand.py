@@ -28,7 +28,13 @@ from handtouch.client.daemon_clock import DaemonClock, age_limit_s
 from handtouch.client.hand_state import HandState
 from handtouch.client.link_columns import FrameName, HandArrays, LinkColumn, LinkColumns
 from handtouch.client.listener import Listener
-from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect, request
+from handtouch.client.subscriber import (
+    SERVICE_TIMEOUT_S,
+    UnknownNameError,
+    connect,
+    request,
+    unknown_name,
+)
 from handtouch.client.wrench import Wrench
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
@@ -57,8 +63,9 @@ class Hand(LinkColumns):
     `max_age_s`: None: three of the hand's periods, or MIN_AGE_LIMIT_S if that is longer. Frames of a replay,
     whose `service` says so, have the age since their reception.
     Raises ValueError for an invalid name or endpoint and for an unusable key file; receiving raises
-    PermissionError when the daemon rejects this client. Not thread-safe; callbacks have a thread and a
-    connection of their own (`on_contact`, `on_frame`).
+    PermissionError when the daemon rejects this client, and UnknownNameError while it has no hand of this
+    name. Nothing received for 2 s is logged once, with the reason. Not thread-safe; callbacks have a thread
+    and a connection of their own (`on_contact`, `on_frame`).
     """
 
     def __init__(
@@ -86,6 +93,7 @@ class Hand(LinkColumns):
         self._frame_topic, self._contact_prefix = f"hand/{name}".encode(), f"contact/{name}/".encode()
         for prefix in (self._frame_topic, self._contact_prefix, b"service"):
             self._connection.socket.subscribe(prefix)
+        self._unknown = ""
         self._state = HandState()
         self._arrays: HandArrays | None = None
         self._undecoded: dict[bytes, tuple[int, list[bytes]]] = {}  # newest of each contact topic
@@ -103,11 +111,16 @@ class Hand(LinkColumns):
         """Return the newest frame that has arrived, the same object while there is no newer one.
 
         Never blocks. None before the first frame, without a daemon, and while the newest is older than
-        `max_age_s`. Raises PermissionError when the daemon rejects this client.
+        `max_age_s`. Raises PermissionError when the daemon rejects this client, and UnknownNameError while it
+        has no hand of this name.
         """
         if zmq_poll(self._items, 0):
             self._drain()
             self._connection.check()
+        else:
+            self._connection.warn_of_silence()
+        if self._unknown:
+            raise UnknownNameError(self._unknown)
         if self._connection.disconnects != self._disconnects:
             self._disconnects, self._void_order = self._connection.disconnects, self._received
         self._arrays = self._state.arrays if self.alive else None
@@ -385,6 +398,8 @@ class Hand(LinkColumns):
                 newest[parts[0]] = self._received, parts
         except zmq.Again:
             pass
+        if newest:
+            self._connection.note_message()
         self._last_receive_ns = time.monotonic_ns()
         while self._round_trips:
             self._clock.measure(*self._round_trips.popleft())
@@ -407,5 +422,7 @@ class Hand(LinkColumns):
             self._clock.reset()
         if self._state.arrays is not before:
             self._frame_ns = self._last_receive_ns
+        if isinstance(message, wire.Service):
+            self._unknown = unknown_name(f"hand/{self.name}", message.hands)
         if isinstance(message, wire.HandFrame | wire.Service) and not message.retained:
             self._clock.observe(message.t_ns, self._last_receive_ns)

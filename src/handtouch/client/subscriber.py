@@ -4,14 +4,16 @@
         for contact in messages:
             print(contact.link, contact.event, contact.force_n)
 
-Public names: `connect`, `Subscriber`, `request`; `columns` reads a hand frame as arrays.
+Public names: `connect`, `Subscriber`, `UnknownNameError`, `unknown_name`, `request`; `columns` reads a hand
+frame as arrays.
 """
 
 from __future__ import annotations
 
 import asyncio
+import difflib
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
@@ -91,13 +93,14 @@ def connect(
     On joining, the current state is received first, with `retained` set: active contacts as an update, the
     latest hand frame, health and service. `queue` bounds the messages that wait in this process; when it is
     full, the newest are lost and counted in `lost_messages`. The connection is restored when a daemon
-    restarts.
+    restarts. Nothing received for 2 s is logged once, with the reason.
 
     `key` is this client's key file, for a daemon that requires one (`handtouch keys`). Default: the file
     named by the environment variable HANDTOUCH_KEY; "" for none.
 
     Raises ValueError for a pattern that matches no topic, or one of another `kind`, an invalid endpoint or an
-    unusable key file. Receiving raises PermissionError when the daemon rejects this client.
+    unusable key file. Receiving raises PermissionError when the daemon rejects this client, and
+    UnknownNameError when a pattern matches none of its hands or links.
     """
     for pattern in patterns:
         if kind is not None and _check_pattern(pattern) != [kind]:
@@ -125,6 +128,8 @@ class Subscriber(Generic[M]):
         self._last_receive_s = time.monotonic()
         self._has_received = False
         self._disconnects = 0  # before the last message
+        self._is_checked = False  # by the daemon's hands and links
+        self._unknown: UnknownNameError | None = None
 
     @classmethod
     def open(
@@ -252,6 +257,8 @@ class Subscriber(Generic[M]):
     def _receive_nowait(self) -> tuple[M, list[bytes]] | None:
         """Return the next matching message that was received already, and its parts."""
         while True:
+            if self._unknown is not None:
+                raise UnknownNameError(*self._unknown.args)
             try:
                 parts = self.connection.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -261,12 +268,17 @@ class Subscriber(Generic[M]):
 
     def _note_reception(self) -> None:
         self._last_receive_s, self._has_received = time.monotonic(), True
-        self._disconnects = self.connection.disconnects
+        self.connection.note_message()
+        if self._disconnects != self.connection.disconnects:
+            self._disconnects = self.connection.disconnects
+            self._is_checked, self._unknown = False, None
 
     def _decode_matching(self, parts: list[bytes]) -> wire.Message | None:
         """Decode a message, None unless it matches a pattern, is valid and new."""
         self._note_reception()
         topic = parts[0].decode("utf-8", "replace") if parts else ""
+        if topic == "service" and not self._is_checked:
+            self._check_names(parts)
         if not any(_topic_matches(pattern, topic) for pattern in self.patterns):
             return None  # another topic under the same prefix, or the heartbeat
         try:
@@ -276,6 +288,17 @@ class Subscriber(Generic[M]):
             return None
         is_new = self._sequence.accept(topic, message.session, message.seq, message.retained)
         return message if is_new else None
+
+    def _check_names(self, parts: list[bytes]) -> None:
+        """Let receiving raise UnknownNameError if a pattern matches nothing that the daemon has."""
+        try:
+            service = wire.decode(parts)
+        except wire.WireError:
+            return  # counted where it was subscribed
+        if isinstance(service, wire.Service):
+            self._is_checked = True
+            unknown = [text for pattern in self.patterns if (text := unknown_name(pattern, service.hands))]
+            self._unknown = UnknownNameError(unknown[0]) if unknown else None
 
 
 def columns(frame: wire.HandFrame | wire.Raw) -> dict[str, NDArray[Any]]:
@@ -310,9 +333,7 @@ def request(
         connection.socket.send(msgpack.packb({"v": wire.SCHEMA_VERSION, "command": command, **arguments}))
         while not connection.readable:
             if not connection.poll(max(0, round((end_s - time.monotonic()) * 1000))):
-                raise TimeoutError(
-                    f"no daemon answers at {endpoint} in {timeout_s} s; check that `handtouch run` is running"
-                )
+                raise TimeoutError(f"no answer in {timeout_s} s: {connection.reason_of_silence}")
         answer = msgpack.unpackb(connection.socket.recv())
     finally:
         connection.close()
@@ -321,12 +342,44 @@ def request(
     return answer
 
 
+class UnknownNameError(LookupError):
+    """The daemon has no such hand or link; the text names those that it has."""
+
+
+def unknown_name(pattern: str, hands: Mapping[str, Sequence[str]]) -> str:
+    """Return why a pattern matches no topic of a daemon with these hands and their links; "" if it does."""
+    reasons = [
+        _unknown_key(dict(zip(topic.keys, parts, strict=True)), hands) for topic, parts in _rows(pattern)
+    ]
+    return "" if "" in reasons or not hands else reasons[0]
+
+
+def _unknown_key(keys: Mapping[str, str], hands: Mapping[str, Sequence[str]]) -> str:
+    hand, link = keys.get("hand", "*"), keys.get("link", "*")
+    named = [name for name in hands if fnmatchcase(name, hand)]
+    if not named:
+        return f"the daemon has no hand {hand!r}; it has {', '.join(hands)}"
+    links = [name for hand in named for name in hands[hand]]
+    if any(fnmatchcase(name, link) for name in links):
+        return ""
+    close = difflib.get_close_matches(link, links, 1)
+    hint = f"did you mean {close[0]!r}?" if close else f"the links are {', '.join(links)}"
+    return f"no link {link!r} on {', '.join(named)}; {hint}"
+
+
+def _rows(pattern: str) -> list[tuple[wire.Topic, list[str]]]:
+    """Return the topics that a pattern matches, and the parts for the keys of each."""
+    prefix, *parts = pattern.split("/")
+    return [
+        (topic, parts)
+        for topic in wire.TOPICS
+        if len(parts) == len(topic.keys) and fnmatchcase(topic.prefix, prefix)
+    ]
+
+
 def _check_pattern(pattern: str) -> list[type[Any]]:
     """Return the types of messages that a pattern matches. Raises ValueError if there is none."""
-    parts = pattern.split("/")
-    kinds = [
-        t.payload for t in wire.TOPICS if len(parts) == len(t.keys) + 1 and fnmatchcase(t.prefix, parts[0])
-    ]
+    kinds: list[type[Any]] = [topic.payload for topic, _ in _rows(pattern)]
     if not kinds:
         rows = ", ".join(topic.pattern for topic in wire.TOPICS)
         raise ValueError(f"no topic matches the pattern {pattern!r}; the topics are {rows}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from handtouch import wire
 
-DISCONNECTED_TEXT = "daemon disconnected; check that `handtouch run` is running"
+DISCONNECTED_TEXT = "daemon disconnected; start `handtouch run FILE` again"
 UNCALIBRATED_STATES = ("quarantined", "manual_required")
 """Calibration states of a pad whose forces aren't calibrated."""
 

@@ -11,12 +11,18 @@
 #include <chrono>
 #include <fstream>
 #include <functional>
+#include <iostream>
 #include <map>
 #include <memory>
 
 #include "handtouch/messages.hpp"
 
 namespace handtouch {
+
+// The daemon has no such hand; the text names those that it has.
+struct UnknownNameError : std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
 
 // A client's CURVE keys, of a file by `handtouch keys client`.
 struct ClientKey {
@@ -134,7 +140,8 @@ public:
     // std::runtime_error for an invalid endpoint or key.
     explicit Hand(const std::string& name, const std::string& endpoint = "tcp://127.0.0.1:5580",
                   const ClientKey* key = nullptr, std::chrono::nanoseconds max_age = {})
-        : max_age_ns_(max_age.count()), is_local_(is_local(endpoint)), frame_topic_("hand/" + name), contact_prefix_("contact/" + name + "/"), context_(zmq_ctx_new()),
+        : max_age_ns_(max_age.count()), is_local_(is_local(endpoint)), name_(name), endpoint_(endpoint),
+          frame_topic_("hand/" + name), contact_prefix_("contact/" + name + "/"), context_(zmq_ctx_new()),
           socket_(zmq_socket(context_.get(), ZMQ_SUB)), monitor_(zmq_socket(context_.get(), ZMQ_PAIR)) {
         check(zmq_socket_monitor(socket_.get(), monitor_endpoint, ZMQ_EVENT_DISCONNECTED), "monitor");
         check(zmq_connect(monitor_.get(), monitor_endpoint), "monitor");
@@ -157,9 +164,15 @@ public:
     }
 
     // The newest frame that has arrived; never blocks. nullptr before the first, without a daemon, and while the
-    // newest is older than `max_age` by its own time. Valid until the next call of `latest` or `wait`.
+    // newest is older than `max_age` by its own time. Valid until the next call of `latest` or `wait`. Throws
+    // UnknownNameError while the daemon has no hand of this name. Nothing received for 2 s is logged once.
     const Frame* latest() {
         drain();
+        if (received_ == 0 && Clock::now() >= warn_at_) {
+            warn_at_ = Clock::time_point::max();
+            std::clog << "handtouch: no daemon at " << endpoint_ << "; start `handtouch run FILE`" << std::endl;
+        }
+        if (!unknown_.empty()) throw UnknownNameError(unknown_);
         while (receive(event_, monitor_.get(), ZMQ_DONTWAIT)) {
             void_order_ = received_;
             while (more(monitor_.get())) receive(event_, monitor_.get(), 0);
@@ -173,9 +186,11 @@ public:
         const auto end = Clock::now() + (timeout < longest ? timeout : std::chrono::milliseconds(longest));
         const Frame* frame = latest();
         while (frame == nullptr || (frame->session == seen_session_ && frame->seq == seen_seq_)) {
-            const auto left = std::chrono::ceil<std::chrono::milliseconds>(end - Clock::now());
+            const auto until = received_ == 0 ? std::min<Clock::time_point>(end, warn_at_) : end;
+            const auto left = std::chrono::ceil<std::chrono::milliseconds>(until - Clock::now());
             zmq_pollitem_t items[] = {{socket_.get(), 0, ZMQ_POLLIN, 0}, {monitor_.get(), 0, ZMQ_POLLIN, 0}};
-            if (left.count() < 0 || zmq_poll(items, 2, static_cast<long>(left.count())) == 0) return nullptr;
+            if (left.count() < 0 || zmq_poll(items, 2, static_cast<long>(left.count())) == 0)
+                if (until == end) return nullptr;
             frame = latest();
         }
         seen_session_ = frame->session;
@@ -287,6 +302,10 @@ private:
     void feed_service(const Service& service, std::int64_t order) {
         receive_ns_ = now_ns();
         state_.feed(service, order);
+        const bool has_hand = std::count(service.hands.begin(), service.hands.end(), name_) > 0;
+        unknown_ = has_hand ? "" : "the daemon has no hand '" + name_ + "'; it has";
+        for (const std::string& hand : service.hands)
+            if (!has_hand) unknown_ += (hand == service.hands.front() ? " " : ", ") + hand;
         if (service.session == state_.session()) observe(service.session, service.t_ns, service.retained);
     }
 
@@ -330,7 +349,8 @@ private:
 
     std::int64_t max_age_ns_;
     bool is_local_;
-    std::string frame_topic_, contact_prefix_, part_, event_;
+    std::string name_, endpoint_, unknown_, frame_topic_, contact_prefix_, part_, event_;
+    Clock::time_point warn_at_ = Clock::now() + std::chrono::seconds(2);  // if nothing was received
     std::unique_ptr<void, CloseContext> context_;
     std::unique_ptr<void, CloseSocket> socket_, monitor_;  // closed before their context
     HandState state_;

@@ -191,6 +191,7 @@ struct Service {
     std::int64_t session = 0, t_ns = 0;
     double period_s = 0.0;
     bool retained = false, replay = false;
+    std::vector<std::string> hands;
 };
 
 inline Service decode_service(std::string_view payload) {
@@ -201,6 +202,8 @@ inline Service decode_service(std::string_view payload) {
     made.period_s = map.at("period_s").as_double();
     made.retained = map.at("retained").as_bool();
     if (const Value* replay = map.find("replay")) made.replay = replay->as_bool();
+    const Value& hands = map.at("hands");  // name, links, name, links, ...
+    for (std::size_t i = 0; i < hands.items.size(); i += 2) made.hands.push_back(hands.items[i].as_text());
     return made;
 }
 
