@@ -315,7 +315,7 @@ def test_status_shows_diagnoses_the_supervisor_and_the_store(capsys: pytest.Capt
     failing = replace(HEALTH, sampling="event", emergencies=tuple(error.to_map() for error in errors))
     pads = [asdict(replace(HEALTH, diagnoses=(GUM,))), asdict(failing)]
     answer = {"service": service, "scene": {"scenes": [], "pads": []}, "pads": pads}
-    status.print_status(answer, Console(width=200))
+    status.print_status(answer, Console(width=200), verbose=True)
     printed = capsys.readouterr().out
     assert (
         "supervisor running, process 7, 0.3 s behind, 1 restarts (last exit: killed by signal 9)" in printed

@@ -20,7 +20,7 @@ from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_channels_of_
 from handtouch.canbus.find.traffic import describe_identifier
 from handtouch.cli.options import add_bus, add_config, add_json, integer, positive_number
 from handtouch.cli.progress import ProgressLine
-from handtouch.cli.tables import make_table, output_console
+from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.host.json_output import to_json
 from handtouch.procedures.scan import (
     BusReport,
@@ -181,13 +181,13 @@ def _print_bus(console: Console, report: BusReport, comparisons: dict[int, NodeC
         for node_id in sorted(nodes.keys() | comparisons.keys()):
             node = nodes.get(node_id, NodeFacts(node_id))
             table.add_row(*_node_cells(node, comparisons.get(node_id), "query" in durations))
-        console.print(table)
+        print_table(console, table)
     for address in report.unconfigured:
         assigned_id = report.assigned.get(address)
         assigned = f", assigned node id {assigned_id}" if assigned_id else ""
         console.print(Text(f"without node id: {address}{assigned}"))
     if report.streams:
-        console.print(_traffic_table(report))
+        print_table(console, _traffic_table(report))
     console.print()
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -12,24 +13,34 @@ from rich.text import Text
 
 from handtouch.cli.options import add_endpoint, add_json
 from handtouch.cli.scene_text import scene_lines
-from handtouch.cli.tables import make_table, output_console
+from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.client import CONTROL_ENDPOINT, request
 from handtouch.host.json_output import print_json
 from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
 
-_COLUMNS: tuple[tuple[str, bool, Callable[[dict[str, Any]], str]], ...] = (
-    ("link", False, lambda pad: f"{pad['hand']}/{pad['link']}"),
-    ("pad", False, lambda pad: pad["state"] + _calibration_note(pad)),
+_Column = tuple[str, bool, Callable[[dict[str, Any]], str]]
+_LINK: _Column = ("link", False, lambda pad: f"{pad['hand']}/{pad['link']}")
+_STATE: _Column = ("state", False, lambda pad: pad["state"] + _calibration_note(pad))
+_RATE: _Column = ("Hz", True, lambda pad: f"{pad['rate_hz']:.0f}")
+_REASON: _Column = (
+    "reason",
+    False,
+    lambda pad: "; ".join(filter(None, [pad["reason"], *_active_errors(pad)])),
+)
+_COLUMNS = (_LINK, _STATE, _RATE, _REASON)
+"""Columns of the table of pads: header, number, text of a pad."""
+_VERBOSE_COLUMNS = (
+    _LINK,
+    _STATE,
     ("node", False, lambda pad: pad["node_state"] + " (event)" * (pad["sampling"] == "event")),
     ("id", True, lambda pad: str(pad["node_id"])),
     ("serial", True, lambda pad: "" if pad["serial"] is None else str(pad["serial"])),
-    ("Hz", True, lambda pad: f"{pad['rate_hz']:.0f}"),
-    ("missed", True, lambda pad: str(pad["missed_samples"])),
+    _RATE,
+    ("missed", True, lambda pad: f"{pad['missed_samples']}"),
     ("heartbeats missed", True, lambda pad: str(pad["heartbeats_missed"])),
     ("reboots", True, lambda pad: str(pad["reboots"])),
-    ("reason", False, lambda pad: "; ".join(filter(None, [pad["reason"], *_active_errors(pad)]))),
+    _REASON,
 )
-"""Columns of the table of pads: header, number, text of a pad."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,9 +48,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(command=run)
     add_endpoint(parser, CONTROL_ENDPOINT, "control endpoint")
     add_json(parser)
+    parser.add_argument(
+        "-v", "--verbose", action="store_true", help="also timing, buses' counters, scenes and nodes"
+    )
 
 
-def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bool = False) -> int:
+def run(
+    *,
+    endpoint: str = CONTROL_ENDPOINT,
+    key: str | None = None,
+    as_json: bool = False,
+    verbose: bool = False,
+) -> int:
     """Print the status; exit status 0 (pads and store ok), 1 (not all, or no daemon), 2 (usage)."""
     try:
         answer = request("status", endpoint=endpoint, key=key)
@@ -52,7 +72,7 @@ def run(*, endpoint: str = CONTROL_ENDPOINT, key: str | None = None, as_json: bo
     if as_json:
         print_json(answer)
     else:
-        print_status(answer, output_console())
+        print_status(answer, output_console(), verbose)
     return 0 if is_all_ok(answer) else 1
 
 
@@ -67,22 +87,39 @@ def is_ok(pad: dict[str, Any]) -> bool:
     return pad["state"] in ("clear", "touched", "off") and not _calibration_note(pad)
 
 
-def print_status(answer: dict[str, Any], console: Console) -> None:
-    """Print the reply to the control command `status`."""
+def print_status(answer: dict[str, Any], console: Console, verbose: bool = False) -> None:
+    """Print the reply to the control command `status`: a verdict, what is wrong, pads; `verbose`: all."""
     service = answer["service"]
-    _print_daemon(service, console)
+    console.print(_verdict(answer), style="green" if is_all_ok(answer) else "red")
+    if verbose:
+        _print_daemon(service, console)
+    if not service["core_compiled"]:
+        console.print("core: uncompiled, fifty times slower per contact; `handtouch doctor` names the remedy")
     for name, bus in service["buses"].items():
-        _print_bus(name, bus, console)
-    for line in scene_lines(answer["scene"]):
-        console.print(line, highlight=False, markup=False)
-    _print_pads(answer["pads"], console)
-    _print_supervisor(answer, console)
+        _print_bus(name, bus, console, verbose)
+    if verbose:
+        for line in scene_lines(answer["scene"]):
+            console.print(line)
+    _print_pads(answer["pads"], console, _VERBOSE_COLUMNS if verbose else _COLUMNS)
+    _print_supervisor(answer, console, verbose)
     _print_rejected_adaptation(answer, console)
     _print_failed_shear_channels(answer, console)
     percepts = service.get("percepts")
-    if percepts is not None and (percepts["state"] != "stopped" or percepts["restarts"]):
-        text = f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped"
-        console.print(text, highlight=False)
+    if percepts is not None and (percepts["restarts"] or (verbose and percepts["state"] != "stopped")):
+        console.print(f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped")
+
+
+def _verdict(answer: dict[str, Any]) -> str:
+    """Return one line: pads that are ok, those that aren't by their states, rate and load of the buses."""
+    pads, service = answer["pads"], answer["service"]
+    faulty = Counter(_STATE[2](pad) for pad in pads if not is_ok(pad))
+    causes = f" ({', '.join(f'{count} {state}' for state, count in faulty.items())})" if faulty else ""
+    buses = ", ".join(f"{name} {100 * bus['load']:.0f} %" for name, bus in service["buses"].items())
+    return (
+        f"{len(pads) - faulty.total()} of {len(pads)} pads ok{causes}, {service['rate_hz']:.0f} Hz"
+        + (f", {buses}" if buses else "")
+        + ("; calibrations can't be stored" if (service.get("supervisor") or {}).get("store_error") else "")
+    )
 
 
 def _print_daemon(service: dict[str, Any], console: Console) -> None:
@@ -93,10 +130,6 @@ def _print_daemon(service: dict[str, Any], console: Console) -> None:
         f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
         + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
-    if not service["core_compiled"]:
-        console.print(
-            "core: uncompiled, some fifty times slower per contact; `handtouch doctor` names the remedy"
-        )
     episodes = _counts_text(service["congestion_episodes"])
     console.print(
         f"congestion episodes: {episodes}; subscriptions: {', '.join(service['subscriptions']) or 'none'}"
@@ -115,13 +148,18 @@ def _print_daemon(service: dict[str, Any], console: Console) -> None:
     )
 
 
-def _print_bus(name: str, bus: dict[str, Any], console: Console) -> None:
+def _print_bus(name: str, bus: dict[str, Any], console: Console, verbose: bool) -> None:
+    """Print a bus that has a problem; `verbose`: every one, with its counters."""
     sync = bus["sync"]
     counts = ", ".join(
         f"{key} {value}" for key, value in bus.items() if isinstance(value, int) and key != "since_ns"
     )
     causes = [f"{cause} {count}" for cause, count in bus["causes"].items()]
     problems = "; ".join(filter(None, [bus["problem"], sync["problem"]]))
+    if not verbose:
+        if problems or bus["state"] != "active":
+            console.print(Text(f"bus {name}: {bus['state']}; {problems}", "red"))
+        return
     jitter = sync["jitter_us"]
     line = (
         f"bus {name}: {bus['state']}, load {100 * bus['load']:.0f} %, SYNC by {sync['by']}"
@@ -132,15 +170,15 @@ def _print_bus(name: str, bus: dict[str, Any], console: Console) -> None:
     console.print(Text.assemble(line, " " if problems else "", (problems, "red")))
 
 
-def _print_pads(pads: list[dict[str, Any]], console: Console) -> None:
+def _print_pads(pads: list[dict[str, Any]], console: Console, columns: Sequence[_Column]) -> None:
     table = make_table(
-        *(header for header, _, _ in _COLUMNS),
-        right=[header for header, number, _ in _COLUMNS if number],
+        *(header for header, _, _ in columns),
+        right=[header for header, number, _ in columns if number],
         wrapped=("reason",),
     )
     for pad in pads:
-        table.add_row(*(text(pad) for _, _, text in _COLUMNS))
-    console.print(table)
+        table.add_row(*(text(pad) for _, _, text in columns))
+    print_table(console, table)
 
 
 def _active_errors(pad: dict[str, Any]) -> list[str]:
@@ -157,29 +195,26 @@ def _process_text(figures: dict[str, Any]) -> str:
     return f"{figures['state']}{process}{lag}, {figures['restarts']} restarts{exited}"
 
 
-def _print_supervisor(answer: dict[str, Any], console: Console) -> None:
-    """Print the state of the supervisor process and its diagnoses."""
+def _print_supervisor(answer: dict[str, Any], console: Console, verbose: bool) -> None:
+    """Print the supervisor's faults and diagnoses; `verbose`: also the state of its process."""
     figures = answer["service"].get("supervisor")
     if figures is None:
         return
-    console.print(
-        f"supervisor {_process_text(figures)}; calibrations: {figures['summary'] or 'not known yet'}",
-        highlight=False,
-    )
+    if verbose or figures["restarts"]:
+        summary = figures["summary"] or "not known yet"
+        console.print(f"supervisor {_process_text(figures)}; calibrations: {summary}")
     if figures["store_error"]:
-        text = f"calibration store: {figures['store_error']}"
-        console.print(text, highlight=False, markup=False, style="red")
+        console.print(f"calibration store: {figures['store_error']}", style="red")
     for pad in answer["pads"]:
         for diagnosis in pad.get("diagnoses", ()):
-            text = f"{pad['hand']}/{pad['link']}: {diagnosis_text(diagnosis)}"
-            console.print(text, highlight=False, markup=False, style="yellow")
+            console.print(f"{pad['hand']}/{pad['link']}: {diagnosis_text(diagnosis)}", style="yellow")
 
 
 def _print_rejected_adaptation(answer: dict[str, Any], console: Console) -> None:
     """Print the pads whose adaptation isn't compensated."""
     if rejected := [pad["link"] for pad in answer["pads"] if pad.get("adaptation_status") == "rejected"]:
         text = f"adaptation not compensated, as steady holds drift less without: {', '.join(rejected)}"
-        console.print(text, highlight=False, markup=False)
+        console.print(text)
 
 
 def _print_failed_shear_channels(answer: dict[str, Any], console: Console) -> None:
@@ -187,7 +222,7 @@ def _print_failed_shear_channels(answer: dict[str, Any], console: Console) -> No
     for pad in answer["pads"]:
         if (status := pad.get("shear_status", "")) in ("dead", "saturated", "shorted"):
             text = f"{pad['hand']}/{pad['link']}: channels of the shear pad {status}; check its leads"
-            console.print(text, highlight=False, markup=False, style="yellow")
+            console.print(text, style="yellow")
 
 
 def _calibration_note(pad: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     style.add_argument(
         "--json", dest="style", action="store_const", const="json", help="print JSON, a line per message"
     )
+    parser.add_argument("--wide", action="store_true", help="don't shorten lines to the terminal's width")
     parser.add_argument(
         "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
     )
@@ -42,6 +44,7 @@ def run(
     endpoint: str,
     key: str | None,
     style: str = "auto",
+    wide: bool = False,
     seconds: float = 0,
 ) -> int:
     """Show messages until Ctrl-C, or for `seconds`; `style`: auto, plain or json.
@@ -57,7 +60,10 @@ def run(
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    display: Display = LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json")
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() and not wide else None
+    display: Display = (
+        LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json", columns)
+    )
     try:
         with messages, display:
             show_messages(messages, display, lambda: time.monotonic() > end_s)

@@ -57,10 +57,14 @@ class LiveDisplay:
 
 
 class LineDisplay:
-    """One line per message; plain lines omit repetitions, JSON lines contain every message."""
+    """One line per message; plain lines omit repetitions, JSON lines contain every message.
 
-    def __init__(self, as_json: bool = False) -> None:
+    `columns`: width that plain lines are shortened to, None: not.
+    """
+
+    def __init__(self, as_json: bool = False, columns: int | None = None) -> None:
         self._as_json = as_json
+        self._columns = columns
         self._printed_ns: dict[tuple[str, str], int] = {}
         self._percepts: dict[tuple[str, str], tuple[str, str]] = {}
         self._health: dict[tuple[str, str], tuple[str, ...]] = {}
@@ -71,7 +75,10 @@ class LineDisplay:
             print_json_line(message)
             return
         if self._has_changed(message):
-            print(message_line(message), flush=True)
+            line = message_line(message)
+            if self._columns is not None and len(line) > self._columns:
+                line = line[: self._columns - 1] + "…"
+            print(line, flush=True)
 
     def _has_changed(self, message: wire.Message) -> bool:
         if isinstance(message, wire.Health):
