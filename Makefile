@@ -109,7 +109,7 @@ bench: ## run the benchmarks: errors, latency, load; an hour
 soak: ## run the endurance tests
 stress: ## run sweeps that are too slow for the tests
 bench soak stress: $(VENV)/.dev $(VENV)/.core
-	@PYTHONPATH=. $(BIN)/python benchmarks/run_programs.py $@ '$(ONLY)' $(ARGS)
+	@PYTHONPATH=. $(BIN)/python -m benchmarks.run_programs $@ '$(ONLY)' $(ARGS)
 
 # --- maintain
 

@@ -29,8 +29,8 @@ from typing import Any
 import msgpack
 import numpy as np
 import zmq
-from page import made_by, options, output_folder, table
 
+from benchmarks.page import made_by, options, output_folder, table
 from handtouch import config, wire
 from handtouch.config import shipped
 

@@ -24,9 +24,9 @@ from typing import Any
 
 import msgpack
 import zmq
-from page import ROOT, made_by, options, output_folder, table
 
 import handtouch
+from benchmarks.page import ROOT, made_by, options, output_folder, table
 from handtouch import wire
 from handtouch.client.hand import Hand
 

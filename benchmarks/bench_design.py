@@ -8,8 +8,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from page import ROOT, made_by, options, output_folder, progress, table
-
+from benchmarks.page import ROOT, made_by, options, output_folder, progress, table
 from handtouch import config
 from handtouch.design import (
     GOALS,

@@ -12,7 +12,7 @@ import json
 import multiprocessing
 import os
 
-from page import made_by, options, output_folder, progress, table
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -26,9 +26,18 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_episodes import EPISODES_OF_HAND, FAULT_FREE, FAULTY, LENGTH_S, PADS, Episode, episode, hand_of
-from scores import EventScore, Share, score_events
 
+from benchmarks.diagnose_episodes import (
+    EPISODES_OF_HAND,
+    FAULT_FREE,
+    FAULTY,
+    LENGTH_S,
+    PADS,
+    Episode,
+    episode,
+    hand_of,
+)
+from benchmarks.scores import EventScore, Share, score_events
 from handtouch import config
 from handtouch.config import shipped
 from handtouch.simulate.worlds import WORLDS

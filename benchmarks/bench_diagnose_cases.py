@@ -12,7 +12,7 @@ import json
 import multiprocessing
 import os
 
-from page import made_by, options, output_folder, progress, table
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -24,7 +24,8 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from diagnose_cases import (
+
+from benchmarks.diagnose_cases import (
     CASES,
     DRYING_S,
     HAND_EPISODES,
@@ -35,8 +36,7 @@ from diagnose_cases import (
     matches,
     play_case,
 )
-from scores import Share, score_events
-
+from benchmarks.scores import Share, score_events
 from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS
 from handtouch.wire.faults import FaultKind
 

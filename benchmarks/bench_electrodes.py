@@ -17,8 +17,10 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from bench_worlds import UNITS, WARM_UP, drawn_world, with_stated_touches
-from hand_touches import (
+from numpy.typing import NDArray
+
+from benchmarks.bench_worlds import UNITS, WARM_UP, drawn_world, with_stated_touches
+from benchmarks.hand_touches import (
     FORCES_N,
     REST_S,
     SAMPLE_S,
@@ -32,11 +34,9 @@ from hand_touches import (
     serve,
     tangent_basis,
 )
-from linear_pads import LinearPads, squared_deviation
-from numpy.typing import NDArray
-from page import made_by, options, output_folder, table
-from scores import ClusterShare, Estimates, EstimateScore, bin_labels, concatenate, slices
-
+from benchmarks.linear_pads import LinearPads, squared_deviation
+from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.scores import ClusterShare, Estimates, EstimateScore, bin_labels, concatenate, slices
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel

@@ -15,10 +15,10 @@ import matplotlib
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress, table
 from scipy.special import ndtri
-from scores import Estimates, EstimateScore, laplace_covariance
 
+from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.scores import Estimates, EstimateScore, laplace_covariance
 from handtouch.field import (
     ElectrodeNetwork,
     Rectangle,

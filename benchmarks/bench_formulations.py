@@ -22,10 +22,10 @@ import numpy as np
 import scipy
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress
-from ratio_table import RatioTable
 from scipy.special import elliprf
 
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.ratio_table import RatioTable
 from handtouch.field import Rectangle
 
 FloatArray = NDArray[np.float64]

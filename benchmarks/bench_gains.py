@@ -19,10 +19,10 @@ import matplotlib
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress, table
 from scipy.stats import chi2
-from scores import Share
 
+from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.scores import Share
 from handtouch.calibration.auto_calibration import new_gain_estimator
 from handtouch.calibration.contact_scores import fisher_covariance, gain_deviation
 from handtouch.calibration.gains import GainEstimator

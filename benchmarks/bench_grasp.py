@@ -16,16 +16,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from page import made_by, options, output_folder, progress
-from scores import Share
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.scores import Share
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
-from grasp_run import PARTS, Served, against, at_best, drawn_world, served
 from numpy.typing import NDArray
 
+from benchmarks.grasp_run import PARTS, Served, against, at_best, drawn_world, served
 from handtouch.config import (
     Deployment,
     Touch,

@@ -19,10 +19,10 @@ from typing import Any
 
 import can
 import numpy as np
-from bench_latency import PORT, ProcessorShare, in_own_network, on_loopback, open_bus
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 
+from benchmarks.bench_latency import PORT, ProcessorShare, in_own_network, on_loopback, open_bus
+from benchmarks.page import made_by, options, output_folder
 from handtouch.client import request
 from handtouch.config import Deployment, load
 from handtouch.device import DeviceBus

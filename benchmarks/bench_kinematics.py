@@ -15,8 +15,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config import load, shipped
 from handtouch.config.tables import SceneRequest

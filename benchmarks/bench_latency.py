@@ -31,8 +31,8 @@ import can
 import numpy as np
 import zmq
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.client import request
 from handtouch.config import Deployment, load, shipped

@@ -25,12 +25,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import matplotlib
 import numpy as np
 import scipy
-from locators import CORE_PADS, LENGTH_MM, WAYS, WIDTH_MM, Locator, Setup
 from numpy.typing import NDArray
-from oracle import PadOracle
-from page import made_by, options, output_folder, table
-from scores import laplace_covariance
 
+from benchmarks.locators import CORE_PADS, LENGTH_MM, WAYS, WIDTH_MM, Locator, Setup
+from benchmarks.oracle import PadOracle
+from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.scores import laplace_covariance
 from handtouch.core.stages import solve
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch

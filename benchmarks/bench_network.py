@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch.field import (
     ContactLaw,
     Electrode,

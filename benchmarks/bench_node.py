@@ -22,9 +22,9 @@ from typing import Any
 
 import can
 import numpy as np
-from bench_latency import ProcessorShare, machine
-from page import made_by, options, output_folder, progress, table
 
+from benchmarks.bench_latency import ProcessorShare, machine
+from benchmarks.page import made_by, options, output_folder, progress, table
 from handtouch import config
 from handtouch.config import shipped
 from tests.node.stand_in import AdcStandIn, node_text, raw_of_ma

@@ -19,9 +19,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress, table
 from skfem import ElementTriP2, ElementTriP3, ElementTriP4
 
+from benchmarks.page import made_by, options, output_folder, progress, table
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel

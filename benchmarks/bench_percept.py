@@ -19,9 +19,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 from scipy.optimize import least_squares
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch.percept.classify import classify_shape
 from handtouch.percept.pipeline import PerceptPipeline
 from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive

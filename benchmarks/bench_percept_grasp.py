@@ -16,15 +16,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from page import made_by, options, output_folder, progress
+from benchmarks.page import made_by, options, output_folder, progress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from grasp_run import Served, drawn_world, served
 from numpy.typing import NDArray
-from scores import Rate, Share
 
+from benchmarks.grasp_run import Served, drawn_world, served
+from benchmarks.scores import Rate, Share
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import can
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import grow_receive_buffer
 from handtouch.config import Bus

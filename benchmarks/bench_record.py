@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 import zmq
-from bench_latency import PATHS, machine
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 
+from benchmarks.bench_latency import PATHS, machine
+from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.config.files import deployment_files

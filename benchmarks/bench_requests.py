@@ -16,9 +16,9 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from bench_latency import machine
-from page import made_by, options, output_folder, table
 
+from benchmarks.bench_latency import machine
+from benchmarks.page import made_by, options, output_folder, table
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import MAX_CLIENT_CHARACTERS, MAX_CLIENTS

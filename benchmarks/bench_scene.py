@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_tick import hands
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 
+from benchmarks.bench_tick import hands
+from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
 from handtouch.core.pad_model import PadModel

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress, table
-from scores import Estimates, EstimateScore, bin_labels, concatenate, draw_calibration, slices
 
+from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.scores import Estimates, EstimateScore, bin_labels, concatenate, draw_calibration, slices
 from handtouch.config.shear import Shear
 from handtouch.field.elastic_layer import calibrate_layer
 from handtouch.field.shear import DiscPattern, ShearPad, overlap_ratio

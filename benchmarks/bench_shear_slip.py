@@ -11,16 +11,16 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from page import made_by, options, output_folder, progress, table
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from bench_percept_grasp import ALARMS, STATED, slips, together
-from grasp_run import Served, drawn_world, served
 from numpy.typing import NDArray
-from scores import Estimates, EstimateScore, Rate, Share, bin_labels, concatenate, slices
 
+from benchmarks.bench_percept_grasp import ALARMS, STATED, slips, together
+from benchmarks.grasp_run import Served, drawn_world, served
+from benchmarks.scores import Estimates, EstimateScore, Rate, Share, bin_labels, concatenate, slices
 from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S

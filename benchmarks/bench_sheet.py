@@ -18,8 +18,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 import numpy.typing as npt
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch.host.units import GRAM_FORCE_N
 from handtouch.sheet import (
     S1,

@@ -15,10 +15,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 import numpy.typing as npt
-from page import made_by, options, output_folder, progress
-from scores import EventScore, Rate, Share, score_events
-from slip_runs import DEPLOYMENT, Record, pads_of, run
 
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.scores import EventScore, Rate, Share, score_events
+from benchmarks.slip_runs import DEPLOYMENT, Record, pads_of, run
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
 

@@ -22,9 +22,18 @@ from pathlib import Path
 from typing import Any
 
 import zmq
-from bench_latency import PATHS, PORT, film, in_own_network, machine, nodes, on_loopback, resident_mb
-from page import made_by, options, output_folder
 
+from benchmarks.bench_latency import (
+    PATHS,
+    PORT,
+    film,
+    in_own_network,
+    machine,
+    nodes,
+    on_loopback,
+    resident_mb,
+)
+from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config import load
 from handtouch.daemon.table_cache import cache_path

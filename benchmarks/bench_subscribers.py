@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 import zmq
-from bench_latency import (
+
+from benchmarks.bench_latency import (
     MOST,
     PATHS,
     PORT,
@@ -43,8 +44,7 @@ from bench_latency import (
     sync_of,
     wait_for_touch,
 )
-from page import made_by, options, output_folder
-
+from benchmarks.page import made_by, options, output_folder
 from handtouch.client import request
 from handtouch.config import load
 

@@ -20,9 +20,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress
-from scores import Estimates, EstimateScore, Share, concatenate, slices
-from sheet_hours import (
+
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.scores import Estimates, EstimateScore, Share, concatenate, slices
+from benchmarks.sheet_hours import (
     COMPLETE,
     CUTS,
     PADS,
@@ -34,8 +35,7 @@ from sheet_hours import (
     rms,
     used,
 )
-from sheet_use import FULL_N, HOUR_S, Holds, drawn_sheets, score_use
-
+from benchmarks.sheet_use import FULL_N, HOUR_S, Holds, drawn_sheets, score_use
 from handtouch.config import Behaviour, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick

@@ -19,10 +19,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from compressed_days import InlineSupervisor
-from page import made_by, options, output_folder, progress, table
-from soak_alarms import Hour
 
+from benchmarks.compressed_days import InlineSupervisor
+from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.soak_alarms import Hour
 from handtouch.canbus.nodes.master import SerialChanged
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline

@@ -20,9 +20,9 @@ import msgpack
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress
-from scores import Share
 
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.scores import Share
 from handtouch import config
 from handtouch.calibration.store_client import StoreClient
 from handtouch.core.pad_model import PadModel

@@ -18,12 +18,12 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from bench_worlds import drawn_world, with_stated_touches
-from hand_touches import REST_S, STEP_S, TOUCH_S, serve, tangent_basis
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, table
-from scores import ClusterShare
 
+from benchmarks.bench_worlds import drawn_world, with_stated_touches
+from benchmarks.hand_touches import REST_S, STEP_S, TOUCH_S, serve, tangent_basis
+from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.scores import ClusterShare
 from handtouch import wire
 from handtouch.config import Pad, load, shipped
 from handtouch.core.pad_model import PadModel

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
 
+from benchmarks.page import made_by, options, output_folder
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick

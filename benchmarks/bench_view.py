@@ -27,15 +27,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bench_latency import (
+from benchmarks.bench_latency import (
     PORT,
     ProcessorShare,
     in_own_network,
     on_loopback,
 )
-from bench_subscribers import Rows, asked_of, bystanders, in_turns, serving, write
-from page import made_by
-
+from benchmarks.bench_subscribers import Rows, asked_of, bystanders, in_turns, serving, write
+from benchmarks.page import made_by
 from handtouch import Robot
 from handtouch.client import request
 from handtouch.config import load

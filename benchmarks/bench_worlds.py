@@ -21,7 +21,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import matplotlib
 import numpy as np
-from hand_touches import (
+from numpy.typing import NDArray
+
+from benchmarks.hand_touches import (
     FORCES_N,
     REST_S,
     SAMPLE_S,
@@ -31,11 +33,9 @@ from hand_touches import (
     compare,
     draw_touches,
 )
-from numpy.typing import NDArray
-from oracle import PadOracle
-from page import made_by, options, output_folder, table
-from scores import Estimates, EstimateScore, concatenate, draw_calibration, slices
-
+from benchmarks.oracle import PadOracle
+from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.scores import Estimates, EstimateScore, concatenate, draw_calibration, slices
 from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped

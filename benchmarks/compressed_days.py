@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
-from bench_latency import descriptors, resident_mb
-from inline_process import InlineProcess
 from numpy.typing import NDArray
-from page import progress
 from scipy.stats import chi2
-from soak_alarms import BLOCK_S, BUSY_HZ, Hour
 
+from benchmarks.bench_latency import descriptors, resident_mb
+from benchmarks.inline_process import InlineProcess
+from benchmarks.page import progress
+from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
 from handtouch import wire
 from handtouch.calibration.store_client import StoreClient
 from handtouch.canbus.nodes.master import SerialChanged

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from bench_latency import descriptors, in_own_network, on_loopback, resident_mb
-from compressed_days import Act
-from page import progress
 
+from benchmarks.bench_latency import descriptors, in_own_network, on_loopback, resident_mb
+from benchmarks.compressed_days import Act
+from benchmarks.page import progress
 from handtouch.client import connect, request
 from handtouch.config import load
 

@@ -11,9 +11,18 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from diagnose_episodes import ELECTRODES, FAULTY, PADS, Play, deployment, draw_fault, sample_blocks, size_mm
 from pydantic import TypeAdapter
 
+from benchmarks.diagnose_episodes import (
+    ELECTRODES,
+    FAULTY,
+    PADS,
+    Play,
+    deployment,
+    draw_fault,
+    sample_blocks,
+    size_mm,
+)
 from handtouch import config
 from handtouch.config.surfaces import PadSurface
 from handtouch.simulate.faults import FAULTS, Fault

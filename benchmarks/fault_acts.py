@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import can
-from fault_bench import TPDO
 
+from benchmarks.fault_bench import TPDO
 from handtouch.device import Device, LineFaults
 
 SYNC_ID, NMT, SDO_ANSWER, HEARTBEAT = 0x080, 0x000, 0x580, 0x700

@@ -17,8 +17,8 @@ from typing import Any
 
 import can
 import numpy as np
-from bench_latency import CHANNEL, PORT
 
+from benchmarks.bench_latency import CHANNEL, PORT
 from handtouch.config import Deployment
 from handtouch.device import DeviceBus
 

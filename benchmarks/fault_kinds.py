@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from fault_acts import (
+from benchmarks.fault_acts import (
     ABORT,
     Fault,
     Kind,

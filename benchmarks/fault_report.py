@@ -9,8 +9,9 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from fault_acts import Fault
-from fault_kinds import KINDS
+
+from benchmarks.fault_acts import Fault
+from benchmarks.fault_kinds import KINDS
 
 LEAK_KB_PER_MIN = 300.0
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import zmq
-from daemon_settings import decoded, pipeline_of
-from inline_process import InlineProcess
 from numpy.typing import NDArray
 
+from benchmarks.daemon_settings import decoded, pipeline_of
+from benchmarks.inline_process import InlineProcess
 from handtouch import wire
 from handtouch.config import Deployment, Touch
 from handtouch.core.link_poses import LinkPoses

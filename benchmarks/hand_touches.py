@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from daemon_settings import decoded, pipeline_of
 from numpy.typing import NDArray
-from oracle import PadOracle
-from scores import Estimates, bin_labels
 
+from benchmarks.daemon_settings import decoded, pipeline_of
+from benchmarks.oracle import PadOracle
+from benchmarks.scores import Estimates, bin_labels
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel

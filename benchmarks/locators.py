@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 import skfem
 from numpy.typing import NDArray
-from ratio_table import RatioTable
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from skfem.models.poisson import laplace
 
+from benchmarks.ratio_table import RatioTable
 from handtouch import config
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.pad_model import PadModel

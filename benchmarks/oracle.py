@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scores import laplace_covariance
 
+from benchmarks.scores import laplace_covariance
 from handtouch import config
 from handtouch.field import ContactLaw, Electrode, ElectrodeNetwork, Surface
 from handtouch.hand import pad_surface

@@ -193,17 +193,17 @@ def _imported(path: Path) -> tuple[Path, ...]:
     found: list[Path] = []
     for node in ast.walk(_tree(path)):
         if isinstance(node, ast.Import):
-            found += [file for alias in node.names for file in _files(alias.name, path)]
+            found += [file for alias in node.names for file in _files(alias.name)]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            found += _files(node.module, path)
-            found += [file for alias in node.names for file in _files(f"{node.module}.{alias.name}", path)]
+            found += _files(node.module)
+            found += [file for alias in node.names for file in _files(f"{node.module}.{alias.name}")]
     return tuple(found)
 
 
-def _files(module: str, importer: Path) -> Iterator[Path]:
-    """Yield the file of a module, with those of its packages, from src or beside the importing program."""
+def _files(module: str) -> Iterator[Path]:
+    """Yield the file of a module, with those of its packages, from src or benchmarks."""
     parts = module.split(".")
-    for folder in (ROOT / "src", importer.parent):
+    for folder in (ROOT / "src", *([ROOT] if parts[0] == "benchmarks" else [])):
         for depth in range(1, len(parts) + 1):
             base = folder.joinpath(*parts[:depth])
             for file in (base.with_suffix(".py"), base / "__init__.py"):

@@ -11,9 +11,9 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from compressed_days import PERIOD_NS, SEED, Days, from_process
-from page import progress
 
+from benchmarks.compressed_days import PERIOD_NS, SEED, Days, from_process
+from benchmarks.page import progress
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.config.tables import Sheet

@@ -15,7 +15,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from page import OUT, keep_run_time, measured_commit
+from benchmarks.page import OUT, keep_run_time, measured_commit
 
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
@@ -89,6 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("kind", choices=("bench", "soak", "stress"))
     parser.add_argument("name", nargs="?", default="*", help="without it: all of this kind")
     asked, options = parser.parse_known_args(arguments)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     programs = found(ROOT / "benchmarks", asked.kind, asked.name)
     if not programs:
         known = ", ".join(path.stem.partition("_")[2] for path in found(ROOT / "benchmarks", asked.kind, "*"))

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scores import ClusterShare, Estimates, Share
-from sheet_use import drawn_sheets, score_use
 
+from benchmarks.scores import ClusterShare, Estimates, Share
+from benchmarks.sheet_use import drawn_sheets, score_use
 from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, Family, SheetKind
 
 FloatArray = NDArray[np.float64]

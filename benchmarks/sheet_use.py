@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scores import Estimates, bin_labels
 
+from benchmarks.scores import Estimates, bin_labels
 from handtouch.config import Behaviour
 from handtouch.core.sheet_force import (
     ForceReliability,

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from daemon_settings import pipeline_of
-from inline_process import InlineProcess
 
+from benchmarks.daemon_settings import pipeline_of
+from benchmarks.inline_process import InlineProcess
 from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel

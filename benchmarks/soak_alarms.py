@@ -11,7 +11,7 @@ import json
 import multiprocessing
 import os
 
-from page import made_by, options, output_folder, progress, table
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scores import Rate
 
+from benchmarks.scores import Rate
 from handtouch import config
 from handtouch.config import shipped
 from handtouch.simulate.faults import INFLUENCES, Fault

@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import can
-from bench_receive_path import FRAME, VCAN, store
-from page import made_by, options, output_folder
 
+from benchmarks.bench_receive_path import FRAME, VCAN, store
+from benchmarks.page import made_by, options, output_folder
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import MAX_QUEUE_FRAMES, grow_receive_buffer
 from handtouch.config import Bus

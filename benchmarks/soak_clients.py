@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_latency import PORT, descriptors, in_own_network, machine, on_loopback, resident_mb
-from hostile_clients import HOSTILE, burner, cpu_seconds, hostile_client
-from page import made_by, options, output_folder, progress
 
+from benchmarks.bench_latency import PORT, descriptors, in_own_network, machine, on_loopback, resident_mb
+from benchmarks.hostile_clients import HOSTILE, burner, cpu_seconds, hostile_client
+from benchmarks.page import made_by, options, output_folder, progress
 from handtouch.client import connect, request
 from handtouch.config import load
 

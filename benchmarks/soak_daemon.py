@@ -12,9 +12,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench_latency import PORT, descriptors, in_own_network, on_loopback, resident_mb
-from page import options
-
+from benchmarks.bench_latency import PORT, descriptors, in_own_network, on_loopback, resident_mb
+from benchmarks.page import options
 from handtouch.client import connect, request
 from handtouch.config import load
 

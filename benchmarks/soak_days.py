@@ -21,16 +21,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from page import made_by, options, output_folder, progress
+
+from benchmarks.page import made_by, options, output_folder, progress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small
 
 import matplotlib
-from bench_latency import machine
-from compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, is_work, run_days
-from cycled_processes import growth, in_own_network, run_cycles, unexplained
-from reloaded_days import RELOAD_PERIOD_S, compare_reloads
 
+from benchmarks.bench_latency import machine
+from benchmarks.compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, is_work, run_days
+from benchmarks.cycled_processes import growth, in_own_network, run_cycles, unexplained
+from benchmarks.reloaded_days import RELOAD_PERIOD_S, compare_reloads
 from handtouch.record.recording import Recording
 from handtouch.record.replay_recording import replay_recording
 

@@ -28,11 +28,11 @@ from typing import Any, ClassVar
 
 import can
 import numpy as np
-from bench_receive_path import VCAN
 from numpy.typing import NDArray
-from page import made_by, options, output_folder, progress
-from peer_verdicts import Starvation, Verdicts
 
+from benchmarks.bench_receive_path import VCAN
+from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.peer_verdicts import Starvation, Verdicts
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
 from handtouch.canbus.bus.loop_pause import LoopPause

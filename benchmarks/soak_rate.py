@@ -31,11 +31,11 @@ from typing import Any
 import can
 import numpy as np
 import zmq
-from bench_latency import PATHS, descriptors, film, machine, resident_mb
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
-from socket_nodes import SocketNodes
 
+from benchmarks.bench_latency import PATHS, descriptors, film, machine, resident_mb
+from benchmarks.page import made_by, options, output_folder
+from benchmarks.socket_nodes import SocketNodes
 from handtouch import wire
 from handtouch.config import (
     Bus,

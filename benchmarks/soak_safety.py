@@ -24,8 +24,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import zmq
-from page import made_by, options, output_folder, progress, table
 
+from benchmarks.page import made_by, options, output_folder, progress, table
 from handtouch import wire
 from handtouch.client.hand import Hand
 from tests.client.hand_messages import make_frame, make_service

@@ -11,7 +11,7 @@ import json
 import math
 import os
 
-from page import made_by, options, output_folder, progress, table
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
@@ -20,10 +20,10 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from scores import Estimates, EstimateScore, slices
-from sheet_hours import COMPLETE, PADS, SEEDS, UNLEARNED, force_row, rms, used
-from sheet_use import FULL_N
 
+from benchmarks.scores import Estimates, EstimateScore, slices
+from benchmarks.sheet_hours import COMPLETE, PADS, SEEDS, UNLEARNED, force_row, rms, used
+from benchmarks.sheet_use import FULL_N
 from handtouch.simulate.worlds import WORLDS, Family, SheetKind
 
 PARTS = (("default", COMPLETE), ("default", UNLEARNED), ("harsh", COMPLETE))

@@ -25,13 +25,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import can
-from bench_latency import PORT, in_own_network, on_loopback
-from fault_acts import Fault, Kind
-from fault_bench import PRESSED, Bench, Cable, Resources, S, UnknownDevice, open_bus, sampler
-from fault_kinds import KINDS
-from fault_report import by_kind, page, section, verdict
-from page import made_by, options, output_folder
 
+from benchmarks.bench_latency import PORT, in_own_network, on_loopback
+from benchmarks.fault_acts import Fault, Kind
+from benchmarks.fault_bench import PRESSED, Bench, Cable, Resources, S, UnknownDevice, open_bus, sampler
+from benchmarks.fault_kinds import KINDS
+from benchmarks.fault_report import by_kind, page, section, verdict
+from benchmarks.page import made_by, options, output_folder
 from handtouch import connect, wire
 from handtouch.client import Subscriber
 from handtouch.config import load

@@ -23,9 +23,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from page import made_by, options, output_folder
-from ratio_table import RatioTable
 
+from benchmarks.page import made_by, options, output_folder
+from benchmarks.ratio_table import RatioTable
 from handtouch.field import (
     Rectangle,
     estimate,

@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from page import made_by, options, output_folder, table
+from benchmarks.page import made_by, options, output_folder, table
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -19,15 +19,14 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import bench_percept_grasp as scored
-import bench_slip
-import grasp_run
 import numpy as np
-from daemon_settings import pipeline_of
-from inline_process import InlineProcess
 from numpy.typing import NDArray
-from page import ROOT, progress
-from slip_runs import PerceptCollector
 
+from benchmarks import bench_slip, grasp_run
+from benchmarks.daemon_settings import pipeline_of
+from benchmarks.inline_process import InlineProcess
+from benchmarks.page import ROOT, progress
+from benchmarks.slip_runs import PerceptCollector
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs

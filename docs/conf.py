@@ -12,11 +12,12 @@ from docutils import nodes
 
 from handtouch import __version__
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 from key_figures import draw_all
 from notebook_page import render_notebook
-from page import outdated
+
+from benchmarks.page import outdated
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_NUMBER_CHARACTERS = 24

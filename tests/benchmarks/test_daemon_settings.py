@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from daemon_settings import pipeline_of
-from hand_touches import serve
 from numpy.typing import NDArray
 
+from benchmarks.daemon_settings import pipeline_of
+from benchmarks.hand_touches import serve
 from handtouch import wire
 from handtouch.calibration.auto_calibration import AutoCalibrator, new_gain_estimator
 from handtouch.calibration.gains import BATCH_CONTACTS

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linear_pads import LinearPads, squared_deviation
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from benchmarks.linear_pads import LinearPads, squared_deviation
 from handtouch.config import load, shipped
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.surfaces import simulated_surface

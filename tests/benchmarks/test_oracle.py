@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench_worlds import contact_noise_a, learn
-from hand_touches import REST_S, SAMPLE_S, STEP_S, draw_touches
-from oracle import OracleCovariances, PadOracle
 
+from benchmarks.bench_worlds import contact_noise_a, learn
+from benchmarks.hand_touches import REST_S, SAMPLE_S, STEP_S, draw_touches
+from benchmarks.oracle import OracleCovariances, PadOracle
 from handtouch import config
 from handtouch.config import load, shipped
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver

@@ -9,8 +9,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import page
 import pytest
+
+from benchmarks import page
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "benchmarks").glob("*.py"))
@@ -116,8 +117,9 @@ def test_a_run_time_is_kept_in_the_readmes_table(tmp_path: Path) -> None:
 def test_a_program_keeps_its_run_time_unless_it_fails(tmp_path: Path, ending: str, is_kept: bool) -> None:
     program = tmp_path / "bench_it.py"
     program.write_text(
-        f"import sys\nfrom pathlib import Path\nsys.path.insert(0, {str(ROOT / 'benchmarks')!r})\n"
-        f"import page\npage.OUT = Path({str(tmp_path)!r})\npage.output_folder(False)\n{ending}\n"
+        f"import sys\nfrom pathlib import Path\nsys.path.insert(0, {str(ROOT)!r})\n"
+        "from benchmarks import page\n"
+        f"page.OUT = Path({str(tmp_path)!r})\npage.output_folder(False)\n{ending}\n"
     )
     subprocess.run([sys.executable, program], check=False, capture_output=True)
     assert (tmp_path / page.RUN_TIMES).exists() is is_kept

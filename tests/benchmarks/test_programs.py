@@ -35,7 +35,7 @@ def test_a_quick_pass_prints_a_stamped_page_and_keeps_none(name: str) -> None:
     pages = ROOT / "docs" / "benchmarks"
     before = {path: path.stat().st_mtime_ns for path in pages.iterdir()}
     done = subprocess.run(
-        [sys.executable, f"benchmarks/{name}.py", "--quick"],
+        [sys.executable, "-m", f"benchmarks.{name}", "--quick"],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -9,9 +9,10 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import page
 import pytest
-from run_programs import SIDE_BY_SIDE, Runner, main
+
+from benchmarks import page
+from benchmarks.run_programs import SIDE_BY_SIDE, Runner, main
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,7 +25,7 @@ def test_what_runs_side_by_side_measures_no_wall_time(name: str) -> None:
         seen.add(path)
         text = path.read_text()
         assert not re.search(r"perf_counter|time\.monotonic|time\.time\b", text), path
-        modules = set(re.findall(r"^(?:from|import) (\w+)", text, re.MULTILINE)) - {"page"}
+        modules = set(re.findall(r"^from benchmarks\.(\w+)", text, re.MULTILINE)) - {"page"}
         own = {ROOT / "benchmarks" / f"{module}.py" for module in modules}
         waiting += [each for each in own - seen if each.exists()]
 
@@ -53,7 +54,7 @@ def test_an_unknown_program_is_refused_with_the_names_of_all(capsys: pytest.Capt
 
 def test_one_named_program_writes_to_the_terminal_and_its_exit_code_is_returned() -> None:
     done = subprocess.run(
-        [sys.executable, "benchmarks/run_programs.py", "bench", "worlds", "--no-such-option"],
+        [sys.executable, "-m", "benchmarks.run_programs", "bench", "worlds", "--no-such-option"],
         cwd=ROOT,
         capture_output=True,
         text=True,

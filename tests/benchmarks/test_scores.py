@@ -7,13 +7,14 @@ import itertools
 import matplotlib
 import numpy as np
 import pytest
-import scores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import ndtr
 from scipy.stats import binom, binomtest, chi2, poisson
+
+from benchmarks import scores
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

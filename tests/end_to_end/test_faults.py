@@ -19,7 +19,7 @@ def test_campaign_of_one_fault_of_each_kind_leaves_nothing_behind(tmp_path: Path
     """With the limits of a busy machine; the figures are in docs/benchmarks/faults.md."""
     options = ["--faults", str(KINDS), "--rate", "3", "--period-ms", "20", "--patience", "5"]
     done = subprocess.run(
-        [sys.executable, "benchmarks/stress_faults.py", *options, "--out", str(tmp_path)],
+        [sys.executable, "-m", "benchmarks.stress_faults", *options, "--out", str(tmp_path)],
         cwd=ROOT,
         capture_output=True,
         text=True,

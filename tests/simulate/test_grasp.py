@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks import grasp_run
 from handtouch import config
 from handtouch.cli import demo
 from handtouch.cli.simulate import run as simulate
@@ -58,19 +53,6 @@ def ball() -> GraspRecord:
 @pytest.fixture(scope="module")
 def pressed(ball: GraspRecord) -> ContactPatches:
     return contact_patches(ball)
-
-
-@pytest.fixture(scope="module")
-def run() -> Iterator[Any]:
-    """The benchmark module that runs the core on a grasp."""
-    path = Path(__file__).parents[2] / "benchmarks" / "grasp_run.py"
-    spec = importlib.util.spec_from_file_location("grasp_run", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["grasp_run"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["grasp_run"]
 
 
 @settings(deadline=None, max_examples=40)
@@ -167,8 +149,8 @@ def test_grasp_is_reproducible_by_seed(ball: GraspRecord) -> None:
     assert other.grasped_object.size_m != ball.grasped_object.size_m
 
 
-def test_reported_contacts_on_a_ball_lie_within_their_covariance(run: Any, ball: GraspRecord) -> None:
-    served = run.served(HAND, "ball", 1, WORLDS["ideal"].draw(1), done=ball)
+def test_reported_contacts_on_a_ball_lie_within_their_covariance(ball: GraspRecord) -> None:
+    served = grasp_run.served(HAND, "ball", 1, WORLDS["ideal"].draw(1), done=ball)
     strong = served.true_n > 0.3
     still = strong & (served.moving_rad_s < 0.2)  # the state of a moving joint is a little old
     assert still.sum() > 500
@@ -190,15 +172,15 @@ def test_reported_contacts_on_a_ball_lie_within_their_covariance(run: Any, ball:
     assert np.median(squared) < 3.0  # 1.39 for two dimensions of noise
     assert np.median(np.linalg.norm(error, axis=1)) < 20e-6
     np.testing.assert_allclose(sum(served.error_m.values()), error, atol=1e-12)
-    events = run.at_best(served, HAND.touch)
+    events = grasp_run.at_best(served, HAND.touch)
     assert events.touches >= 5
     assert events.missed == events.false_positives == 0
     assert events.f1(0.011) > 0.9
 
 
-def test_error_components_are_attributed_to_their_causes(run: Any) -> None:
+def test_error_components_are_attributed_to_their_causes() -> None:
     world = WORLDS["default"].only("mounts").draw(1)
-    served = run.served(HAND, "ball", 1, world, duration_s=1.9)
+    served = grasp_run.served(HAND, "ball", 1, world, duration_s=1.9)
     length = {part: np.linalg.norm(error, axis=1) for part, error in served.error_m.items()}
     for row in np.unique(served.pad):
         mine = served.pad == row

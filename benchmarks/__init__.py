@@ -1,0 +1,1 @@
+"""Programs that measure handtouch, and the pages of what they found."""
