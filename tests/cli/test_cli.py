@@ -21,6 +21,7 @@ import pytest
 from handtouch.cli import build_parser, main
 from handtouch.cli.simulate import SCENARIOS
 from handtouch.config import shipped
+from tests.deployments import deployment_text, pad_text
 
 COMMANDS = [
     *("demo", "run", "simulate", "watch", "status", "keys", "scan", "commission"),
@@ -53,7 +54,7 @@ ALL_COMMANDS = dict(commands_of(build_parser()))
 @pytest.mark.parametrize("name", ALL_COMMANDS)
 def test_options_of_every_command_are_parameters_of_its_function(name: str) -> None:
     parser = ALL_COMMANDS[name]
-    options = {action.dest for action in parser._actions} - {"help"}
+    options = {action.dest for action in parser._actions} - {"help", "daemon_config"}  # `main` takes it
     parameters = inspect.signature(parser.get_default("command")).parameters.values()
     takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
     named = [parameter for parameter in parameters if parameter.kind is not parameter.VAR_KEYWORD]
@@ -94,6 +95,33 @@ def test_status_without_a_daemon_exits_with_status_1_and_a_remedy(
 ) -> None:
     assert main(["status", "--endpoint", endpoints["control"]]) == 1
     assert "start `handtouch run FILE`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("way", ["option", "environment"])
+def test_a_client_command_finds_the_daemon_by_its_deployment_file(
+    way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "hand.toml"
+    endpoints = f'control = "ipc://{tmp_path}/control"\nlive = "ipc://{tmp_path}/live"'
+    file.write_text(deployment_text(pad_text("tip", 5), daemon=f"sync_period_ms = 5.0\n{endpoints}"))
+    given = []
+    if way == "environment":
+        monkeypatch.setenv("HANDTOUCH_CONFIG", str(file))
+    else:
+        given = ["--config", str(file)]
+    assert main(["status", *given]) == 1
+    assert f"ipc://{tmp_path}/control" in capsys.readouterr().err
+    assert main(["watch", "--seconds", "0.1", *given]) == 1
+    assert f"ipc://{tmp_path}/live" in capsys.readouterr().err
+    assert main(["status", "--endpoint", f"ipc://{tmp_path}/other", *given]) == 1  # an option comes first
+    assert f"ipc://{tmp_path}/other" in capsys.readouterr().err
+
+
+def test_a_client_command_with_an_unusable_deployment_exits_with_status_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["status", "--config", str(tmp_path / "none.toml")]) == 2
+    assert "none.toml" in capsys.readouterr().err
 
 
 def test_watch_with_an_unknown_topic_exits_with_status_2(capsys: pytest.CaptureFixture[str]) -> None:

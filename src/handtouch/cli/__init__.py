@@ -20,6 +20,7 @@ from handtouch.cli.options import (
     PrintCompletion,
     SuggestingParser,
     describe_command,
+    find_endpoint,
 )
 
 COMMANDS = {
@@ -98,6 +99,13 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         options = vars(build_parser().parse_args(arguments))
         command: Callable[..., int] = options.pop("command")
+        if (kind := options.pop("endpoint_kind", None)) is not None:
+            config = options.pop("daemon_config", options.get("config"))
+            try:
+                options["endpoint"] = find_endpoint(kind, options["endpoint"], config)
+            except (ValueError, OSError) as error:
+                print(error, file=sys.stderr)
+                return 2
         return command(**options)
     finally:  # --help and wrong usage end by SystemExit
         if sys.stdout is not None:

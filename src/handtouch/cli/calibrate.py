@@ -12,17 +12,16 @@ from typing import Any
 
 from handtouch.calibration.store import StoreError
 from handtouch.cli import requests
-from handtouch.cli.options import LIVE_HELP, integer, positive_number
+from handtouch.cli.options import find_endpoint, integer, positive_number
 from handtouch.cli.requests import add_request
 from handtouch.config import ConfigError
-from handtouch.host.endpoints import LIVE_ENDPOINT
 from handtouch.host.json_output import print_json
 from handtouch.procedures import calibrate
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate`."""
-    add_request(parser, run)
+    add_request(parser, run, config=False)
     parser.add_argument("pad", metavar="PAD", help='pad, such as "left/index_distal"')
     _add_guided(parser.add_argument_group("guided measurement with known weights"))
     _add_direct(parser.add_argument_group("direct setting; omitted values are left unchanged"))
@@ -90,7 +89,7 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         help="time limit for placing a weight or pressing a key (default: 60)",
     )
     guided.add_argument(
-        "--live", default=LIVE_ENDPOINT, metavar="ENDPOINT", help=f"{LIVE_HELP} (default: {LIVE_ENDPOINT})"
+        "--live", metavar="ENDPOINT", help="the daemon's live stream (default: as the deployment file says)"
     )
 
 
@@ -127,7 +126,7 @@ def run(
     endpoint: str,
     key: str | None,
     as_json: bool,
-    live: str,
+    live: str | None,
     weights: str,
     from_file: Path | None,
     config: Path | None,
@@ -158,7 +157,8 @@ def run(
         guided_options = calibrate.CalibrateOptions(
             pad=pad, config=config, weights=weights, from_file=from_file, as_json=as_json, **options
         )
-        return _run_guided(guided_options, calibrate.DaemonEndpoints(live, endpoint, key))
+        stream = find_endpoint("live", live, config)
+        return _run_guided(guided_options, calibrate.DaemonEndpoints(stream, endpoint, key))
     if law is not None:
         values["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), law, strict=True))
         values["law"]["hertz_force_n"] = hertz_force_n

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
+
+from handtouch.host.endpoints import COMPLETE_ENDPOINT, CONTROL_ENDPOINT, LIVE_ENDPOINT, to_connect
 
 EXIT_STATUS_HELP = (
     "Exit status: 0 success; 1 failure, or a problem was found; 2 wrong usage, a file that is missing or "
@@ -17,7 +20,12 @@ EXIT_STATUS_HELP = (
 
 MAX_LISTED_CHOICES = 10
 """of an error message"""
-LIVE_HELP = "endpoint of the daemon's live stream, which drops what a slow subscriber can't take"
+ENDPOINTS = {
+    "live": (LIVE_ENDPOINT, "live stream, which drops what a slow subscriber can't take"),
+    "complete": (COMPLETE_ENDPOINT, "complete stream, which queues messages for slow subscribers"),
+    "control": (CONTROL_ENDPOINT, "control endpoint"),
+}
+"""Key of `[daemon]` -> default and description of an endpoint that commands connect to."""
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[Any]"
 
@@ -123,10 +131,43 @@ def add_bus(
     )
 
 
-def add_endpoint(parser: argparse.ArgumentParser, default: str, text: str) -> None:
-    """Add `--endpoint` and `--key`."""
-    parser.add_argument("--endpoint", default=default, help=f"{text} (default: {default})")
+def add_endpoint(parser: argparse.ArgumentParser, kind: str, *, config: bool = True) -> None:
+    """Add `--endpoint` and `--key`, and `--config` unless the command has it: which daemon to talk to.
+
+    `kind`: a key of ENDPOINTS. `main` replaces the endpoint by `find_endpoint` before the command runs.
+    """
+    parser.set_defaults(endpoint_kind=kind)
+    default, text = ENDPOINTS[kind]
+    if config:
+        parser.add_argument(
+            "--config",
+            dest="daemon_config",
+            type=Path,
+            metavar="FILE",
+            help="deployment file of the daemon, for its endpoint (default: the file in $HANDTOUCH_CONFIG, "
+            "if set)",
+        )
+    parser.add_argument(
+        "--endpoint", help=f"the daemon's {text} (default: as the deployment file says, else {default})"
+    )
     add_key(parser)
+
+
+def find_endpoint(kind: str, endpoint: str | None = None, config: Path | None = None) -> str:
+    """Return the endpoint to connect to: the given one, the deployment's, or the default.
+
+    Without `config` the deployment is the file in $HANDTOUCH_CONFIG, if set. Raises ValueError for a file
+    that can't be used.
+    """
+    file = config or os.environ.get("HANDTOUCH_CONFIG")
+    if endpoint is not None or not file:
+        return endpoint or ENDPOINTS[kind][0]
+    from handtouch.config import load  # only here, so that commands start quickly
+
+    bound: str = getattr(load(Path(file)).daemon, kind)
+    if bound.endswith(":*"):
+        raise ValueError(f"{file}: {kind} = {bound!r} is any free port; give --endpoint")
+    return to_connect(bound)
 
 
 def add_key(parser: argparse.ArgumentParser) -> None:

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from handtouch.cli.errors import file_error_text
-from handtouch.cli.options import add_json, add_key, add_output, add_percepts, positive_number
+from handtouch.cli.options import add_endpoint, add_json, add_output, add_percepts, positive_number
 from handtouch.cli.progress import ProgressLine
 from handtouch.config import ConfigError
-from handtouch.host.endpoints import COMPLETE_ENDPOINT
 from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
@@ -43,12 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
     )
     add_json(parser, "print a summary as JSON at the end")
-    parser.add_argument(
-        "--endpoint",
-        help="endpoint of the daemon's complete stream, which queues messages for slow subscribers "
-        f"(default: the deployment's, or {COMPLETE_ENDPOINT})",
-    )
-    add_key(parser)
+    add_endpoint(parser, "complete", config=False)
     parser.add_argument(
         "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
     )

@@ -22,7 +22,6 @@ from handtouch.cli.options import (
 )
 from handtouch.cli.scene_text import scene_lines
 from handtouch.client import request
-from handtouch.host.endpoints import CONTROL_ENDPOINT
 from handtouch.host.json_output import print_json
 from handtouch.host.user import user_name
 
@@ -111,10 +110,10 @@ def _add_pads(parser: argparse.ArgumentParser, text: str = "", **options: Any) -
     )
 
 
-def add_request(parser: argparse.ArgumentParser, run: Callable[..., int]) -> None:
+def add_request(parser: argparse.ArgumentParser, run: Callable[..., int], *, config: bool = True) -> None:
     """Set the function that runs a command, and add the options of the control endpoint."""
     parser.set_defaults(command=run)
-    add_endpoint(parser, CONTROL_ENDPOINT, "control endpoint")
+    add_endpoint(parser, "control", config=config)
     add_json(parser)
 
 

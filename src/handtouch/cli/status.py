@@ -46,7 +46,7 @@ _VERBOSE_COLUMNS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `status`."""
     parser.set_defaults(command=run)
-    add_endpoint(parser, CONTROL_ENDPOINT, "control endpoint")
+    add_endpoint(parser, "control")
     add_json(parser)
     parser.add_argument(
         "-v", "--verbose", action="store_true", help="also timing, buses' counters, scenes and nodes"

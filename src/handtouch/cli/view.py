@@ -8,9 +8,8 @@ import threading
 import time
 import webbrowser
 
-from handtouch.cli.options import LIVE_HELP, add_endpoint, add_percepts, integer, positive_number
+from handtouch.cli.options import add_endpoint, add_percepts, integer, positive_number
 from handtouch.client import connect
-from handtouch.host.endpoints import LIVE_ENDPOINT
 from handtouch.host.signals import stop_on_signals
 from handtouch.view import page
 from handtouch.view.page.model import PageModel
@@ -25,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="serve Foxglove (scene, frames, log, values to plot) over its WebSocket, instead of a page",
     )
-    add_endpoint(parser, LIVE_ENDPOINT, LIVE_HELP)
+    add_endpoint(parser, "live")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address that the page is served at (default: 127.0.0.1)"
     )

@@ -8,9 +8,8 @@ import sys
 import time
 from collections.abc import Sequence
 
-from handtouch.cli.options import LIVE_HELP, add_endpoint, positive_number
+from handtouch.cli.options import add_endpoint, positive_number
 from handtouch.client import UnknownNameError, connect
-from handtouch.host.endpoints import LIVE_ENDPOINT
 from handtouch.view.displays import Display, LineDisplay, LiveDisplay, show_messages
 
 
@@ -23,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         help='topics such as "contact/*/thumb_*", "hand/*", "service" (default: contacts and health)',
     )
-    add_endpoint(parser, LIVE_ENDPOINT, LIVE_HELP)
+    add_endpoint(parser, "live")
     style = parser.add_mutually_exclusive_group()
     style.add_argument(
         "--plain", dest="style", action="store_const", const="plain", help="print lines, also on a terminal"

@@ -18,8 +18,7 @@ from typing import Any
 
 from handtouch import __version__, wire
 from handtouch.client import SERVICE_TIMEOUT_S, Subscriber
-from handtouch.config import load
-from handtouch.host.endpoints import COMPLETE_ENDPOINT, to_connect
+from handtouch.host.endpoints import COMPLETE_ENDPOINT
 from handtouch.record.mcap_file import RecordingFile
 from handtouch.record.recorder import MessageRecorder, NoScenes, RotationLimits, SceneConverter
 
@@ -40,7 +39,7 @@ class RecordOptions:
 
     config: Path | None = None
     out: Path = Path()
-    endpoint: str | None = None
+    endpoint: str = COMPLETE_ENDPOINT
     key: str | None = None
     seconds: float = 0.0
     """0: until stopped"""
@@ -125,11 +124,10 @@ class Capture:
     @classmethod
     def open(cls, options: RecordOptions) -> Capture:
         """Subscribe to the daemon. Raises ConfigError, ValueError, OSError for wrong options."""
-        endpoint = _complete_endpoint(options)
         topics = (*PATTERNS, *["hand/*"] * options.hand, *["percept/*/*"] * options.percepts)
-        source = Subscriber[Any].open(topics, endpoint, _QUEUE_MESSAGES, options.key)
+        source = Subscriber[Any].open(topics, options.endpoint, _QUEUE_MESSAGES, options.key)
         try:
-            return cls(options, endpoint, source)
+            return cls(options, options.endpoint, source)
         except OSError:
             source.close()
             raise
@@ -194,15 +192,3 @@ def _rotation_limits(options: RecordOptions) -> RotationLimits:
     max_bytes = round(options.rotate_mb * BYTES_PER_MB)
     max_duration_ns = round(options.rotate_minutes * 60e9)
     return RotationLimits(max_bytes or 1 << 62, max_duration_ns or 1 << 62)
-
-
-def _complete_endpoint(options: RecordOptions) -> str:
-    """Return the endpoint of the complete stream. Raises ConfigError, ValueError."""
-    if options.endpoint is not None:
-        return options.endpoint
-    if options.config is None:
-        return COMPLETE_ENDPOINT
-    endpoint = load(options.config).daemon.complete
-    if endpoint.endswith(":*"):
-        raise ValueError(f"{options.config}: {endpoint} is any free port; give --endpoint")
-    return to_connect(endpoint)
