@@ -31,6 +31,28 @@ def test_shipped_hand_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> Non
     assert "no warnings" in output
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "warning"),
+    [
+        ("full_scale_ma = 10.0", "full_scale_ma = 0.01", "exceeds the full scale"),
+        ("full_scale_ma = 10.0", "full_scale_ma = 10000.0", "fewer than 50 counts"),
+        ("drive_v = 5.0", "drive_v = 5000.0", "exceeds the full scale"),
+        ("drive_v = 5.0", "drive_v = 0.005", "fewer than 50 counts"),
+        ("ohm_per_square = 2400.0", "ohm_per_square = 2.4", "check the unit"),
+        (
+            "begin_threshold_n = 0.06",
+            "begin_threshold_n = 6.0",
+            "forces are in newtons, and 1 gram-force is 0.0098 N",
+        ),
+        ("max_force_n = 20.0", "max_force_n = 0.02", "begin_threshold_n = 0.06: above max_force_n"),
+    ],
+)
+def test_values_in_another_unit_are_one_warning_for_all_pads(old: str, new: str, warning: str) -> None:
+    found = [text for text in warnings_of((old, new)) if warning in text]
+    assert len(found) in (1, 2)  # one for each sheet
+    assert sum(text.split(": ")[0].count("right/") for text in found) == 15
+
+
 def test_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
     assert check_command.run(HAND, as_json=True, schema=False) == 0
     report = json.loads(capsys.readouterr().out)

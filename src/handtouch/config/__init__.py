@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,8 @@ def load(path: Path | str) -> Deployment:
 def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) -> Deployment:
     """Check the text of a deployment file; its paths are relative to `folder` (default: current folder)."""
     raw = parse_toml(text, file)
+    if foreign := _foreign_tables(raw):
+        raise ConfigError(file, (Problem("the file", "", foreign),))
     try:
         deployment = Deployment.model_validate(raw)
     except ValidationError as error:
@@ -144,6 +146,17 @@ def json_schema() -> dict[str, Any]:
         **schema,
         "title": "handtouch deployment",
     }
+
+
+def _foreign_tables(raw: Mapping[str, Any]) -> str:
+    """Return what to do with another kind of our files; empty for a deployment."""
+    if raw.keys() & {"node", "sheet", "hand"}:
+        return ""
+    if raw.keys() & {"adc", "pad"}:
+        return "this is the file of a sensor node, for `handtouch node`; give a deployment file"
+    if raw.keys() & {"fault", "swap", "joint"} or isinstance(raw.get("touch"), list):
+        return "this is a scenario, for `handtouch simulate CONFIG --scenario FILE`; give a deployment file"
+    return ""
 
 
 def _parse_bus_text(text: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -49,12 +50,28 @@ class Problem:
 
 
 class ConfigError(ValueError):
-    """A deployment file that can't be used; `problems` holds every error found, `str` one line for each."""
+    """A deployment file that can't be used; `problems` holds every error, `str` has a line for each kind."""
 
     def __init__(self, file: str, problems: tuple[Problem, ...]) -> None:
-        super().__init__("\n".join(f"{file}: {problem}" for problem in problems))
+        super().__init__("\n".join(f"{file}: {line}" for line in _lines(problems)))
         self.file = file
         self.problems = problems
+
+
+_ENTRY = re.compile(r'\[\[[\w.]+\]\] (\d+)(?: "([^"]*)")?')
+"""Location of an entry of a list, as `_locate` writes it: its number and name"""
+
+
+def _lines(problems: Sequence[Problem]) -> Iterator[str]:
+    """Yield a line for each problem; one for those that are the same in several entries of a list."""
+    alike: dict[tuple[str, str, str], list[Problem]] = {}
+    for problem in problems:
+        place = _ENTRY.sub("", problem.location, count=1)
+        alike.setdefault((place, problem.value, problem.remedy), []).append(problem)
+    for first, *others in alike.values():
+        found = [_ENTRY.match(problem.location) for problem in others]
+        names = [match[2] or match[1] for match in found if match]
+        yield str(first) + (f"; the same in {', '.join(names)}" if names else "")
 
 
 def problems_of(
@@ -119,11 +136,10 @@ class _ValidationMistake:
         if self.error_type.startswith("union_tag"):
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
             at, value = (".kind", f" = {_format_input(given)}") if given is not None else ("", value)
-            return Problem(
-                self.location + at,
-                value,
-                "needs " + _join_alternatives(f'kind = "{k}"' for k in self.kinds[self.key]),
-            )
+            kinds = self.kinds[self.key]
+            hint = suggest_name(str(given), list(kinds))
+            remedy = f"{hint}needs {_join_alternatives(f'kind = {_format_input(kind)}' for kind in kinds)}"
+            return Problem(self.location + at, value, remedy)
         if self.error_type == "too_short" and len(self.error["input"]) >= context["min_length"]:
             return None  # pydantic also calls a list too short when all its entries are invalid
         if self.error_type == "string_pattern_mismatch":
@@ -134,6 +150,11 @@ class _ValidationMistake:
             remedy = str(self.error["msg"])
             for theirs, ours in _MESSAGE_REPLACEMENTS:
                 remedy = remedy.replace(theirs, ours)
+        given = self.error["input"]
+        if self.error_type in ("int_type", "float_type", "int_parsing", "float_parsing") and _is_number(
+            given
+        ):
+            remedy += f", without quotes: write {given}"
         if self.error_type == "tuple_type" and isinstance(self.error["input"], dict):
             return Problem(f"[{self.key}]", "", f"must be a list of tables: write [[{self.key}]]")
         if self.error_type == "value_error":  # of a whole table; the message is complete
@@ -151,9 +172,11 @@ class _ValidationMistake:
             )
             return Problem(f"[{self.key}]", "", f"unknown table; {remedy}")
         if not self.closest_key:
-            return Problem(
-                self.location, value, f"unknown key; known here: {', '.join(_key_descriptions(self.model))}"
+            known = _key_descriptions(self.model)
+            remedy = (
+                _period_of_rate(self.key, self.error["input"], known) or f"known here: {', '.join(known)}"
             )
+            return Problem(self.location, value, f"unknown key; {remedy}")
         unit = " Keys carry their unit" if _without_unit(self.key) == _without_unit(self.closest_key) else ""
         return Problem(
             self.location,
@@ -227,6 +250,21 @@ def _closest_key(key: str, candidates: list[str]) -> str | None:
         if any(candidate == key + unit or key == candidate + unit for unit in _UNIT_SUFFIXES):
             return candidate
     return next(iter(difflib.get_close_matches(key, candidates, n=1, cutoff=0.6)), None)
+
+
+def _period_of_rate(key: str, value: object, known: Mapping[str, str]) -> str:
+    """Return the key and value of the period that a rate in Hz stands for; empty if there is none."""
+    period = f"{key.removesuffix('_hz')}_period_ms"
+    if not key.endswith("_hz") or period not in known or not isinstance(value, int | float) or not value > 0:
+        return ""
+    return f"write {period} = {1e3 / value:.4g}"
+
+
+def _is_number(value: object) -> bool:
+    try:
+        return isinstance(value, str) and (float(value) if "x" not in value else int(value, 0)) is not None
+    except ValueError:
+        return False
 
 
 def _without_unit(key: str) -> str:

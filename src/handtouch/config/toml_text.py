@@ -73,9 +73,44 @@ def _syntax_problem(text: str, reason: str) -> Problem:
         return _duplicate_problem(lines, number, named[1] if named else "")
     column = f", column {at[2]}" if at and at[2] else ""
     reason = reason[: at.start()] if at else reason
-    return Problem(
-        f"TOML, line {number}{column}", f" `{_shorten(line)}`", f"{reason}; correct the syntax there"
-    )
+    remedy = _foreign_file(text) or _slip(line.split("#")[0].strip()) or f"{reason}; correct the syntax there"
+    return Problem(f"TOML, line {number}{column}", f" `{_shorten(line)}`", remedy)
+
+
+def _foreign_file(text: str) -> str:
+    """Return what to do with a file of another format, which a deployment names; empty for TOML."""
+    begin = text.lstrip()
+    if begin.startswith("<"):
+        return "this is XML; a robot description (URDF) belongs under urdf of a [[hand]] in a deployment file"
+    if re.search(r"(?im)^\[(fileinfo|deviceinfo)\]", text):
+        return "this is a device description; an EDS belongs under eds of a [node.NAME] in a deployment file"
+    if begin.startswith("{"):
+        return "this is JSON; a deployment file is TOML, such as config/utah_mit.toml"
+    lines = [line.split("#")[0].rstrip() for line in text.splitlines()]
+    given = [line for line in lines if line]
+    if given and sum(bool(re.match(r"\s*(- )?[\w.\-]+:(\s|$)", line)) for line in given) > len(given) / 2:
+        return "this is YAML; a deployment file is TOML, such as config/utah_mit.toml"
+    return ""
+
+
+def _slip(line: str) -> str:
+    """Return the remedy of a usual slip on a line without its comment; empty for another one."""
+    if re.search("[\u201c\u201d\u201e\u2018\u2019]", line):
+        return 'has typographic quotes; write straight ones, "..."'
+    key, _, value = (part.strip() for part in line.partition("="))
+    if re.fullmatch(r"[+-]?\d+,\d+", value):
+        return f"has a decimal comma; write {key} = {value.replace(',', '.')}"
+    if value.lower() in ("none", "null", "nil"):
+        return "TOML has no such value; leave the key out"
+    if value.lower() in ("true", "false"):
+        return f"write {key} = {value.lower()}"
+    if re.fullmatch(r"[A-Za-z_][\w.:/\-]*", value):
+        return f'a text needs quotes; write {key} = "{value}"'
+    if value.count("{") > value.count("}"):
+        return f"an inline table {{...}} stands on one line; write it so, or as a table [{key}] of its own"
+    if not value and (found := re.fullmatch(r"([\w.\-]+)\s*:\s*(.+)", line)):
+        return f"a key and its value are separated by =; write {found[1]} = {found[2]}"
+    return ""
 
 
 def _duplicate_problem(lines: list[str], number: int, inline_key: str) -> Problem:

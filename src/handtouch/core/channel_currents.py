@@ -63,6 +63,13 @@ class ChannelCurrents:
         electrode, place = np.unravel_index(int(np.argmax(currents_a)), currents_a.shape)
         return PeakCurrent(float(currents_a[electrode, place]), int(electrode), float(self._edge_m[place]))
 
+    def middle(self, force_n: float) -> float:
+        """Return the largest current [A] of an electrode by a contact of a force in the pad's middle."""
+        place = self._spreading_m.size // 2
+        spreading_m, series_ohm = self._spreading_m[place], self._series_ohm[place]
+        total_a = self._law.current(force_n, self._drive_v, self._sheet_ohm, spreading_m, series_ohm)
+        return float(total_a * self._fractions[:, place].max())
+
     def measured_force(self, full_scale_a: float) -> tuple[float, PeakCurrent]:
         """Return the greatest force [N] whose contacts, anywhere on the pad, leave every electrode below
         `full_scale_a`, infinite if all do; and the current of that force where it is largest."""

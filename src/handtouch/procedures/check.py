@@ -18,9 +18,16 @@ from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.pad_model import contact_law, law_of
 from handtouch.hand import pad_network, pad_surface
 from handtouch.hand.robot_models import check_urdfs, unchecked_items
+from handtouch.host.units import GRAM_FORCE_N
 
 MAX_USUAL_LOAD = 0.7
 MAX_USUAL_ASPECT = 3.0
+MAX_USUAL_THRESHOLD_N = 1.0
+"""Largest usual threshold: fingers grasp with a few newtons; the shipped hands have 0.06 N"""
+MIN_USUAL_SHEET_OHM = 20.0
+"""Least usual resistance of a sheet: leads of 1 ohm are 5 % of it; the paper's sheets have 2.4 and 15 kohm"""
+MIN_USUAL_COUNTS = 50
+"""Fewest usual counts of 1 N: with fewer, one count is 0.02 N, the shipped hands' hysteresis"""
 _ANY_FORCE_N = 1e3
 
 
@@ -86,8 +93,12 @@ def find_warnings(deployment: config.Deployment) -> Iterator[str]:
     yield from unchecked_items(deployment)
     for hand in deployment.hands:
         yield from _serial_warnings(hand)
+    alike: dict[str, list[str]] = {}
     for entry in deployment.pads:
-        yield from _pad_warnings(entry.name, entry.pad, deployment)
+        for text in _pad_warnings(entry.pad, deployment):
+            alike.setdefault(text, []).append(entry.name)
+    for text, names in alike.items():
+        yield f"{', '.join(names)}: {text}"
 
 
 def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[str]:
@@ -115,27 +126,54 @@ def _serial_warnings(hand: config.HandTable) -> Iterator[str]:
         yield f"{hand.name}: no serial for {', '.join(without)}: replaced sensors are not detected"
 
 
-def _pad_warnings(name: str, pad: config.Pad, deployment: config.Deployment) -> Iterator[str]:
+def _pad_warnings(pad: config.Pad, deployment: config.Deployment) -> Iterator[str]:
     a, b = pad.surface.rectangle_mm
     sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
     touch = pad.touch or deployment.touch
     if not pad.arcs_mm and max(a / b, b / a) > MAX_USUAL_ASPECT:  # electrodes on arcs are anywhere
         long, short = ("x", "y") if a > b else ("y", "x")
         yield (
-            f"{name}: {max(a / b, b / a):.1f} times longer along {long} than along {short}: the far "
+            f"{max(a / b, b / a):.1f} times longer along {long} than along {short}: the far "
             "electrodes carry almost no current, so positions are inaccurate"
         )
     if 2 * sheet.contact_radius_mm > min(a, b) / 2:
         yield (
-            f"{name}: contact_radius_mm = {sheet.contact_radius_mm}: large for a pad of "
+            f"contact_radius_mm = {sheet.contact_radius_mm}: large for a pad of "
             f"{min(a, b):.1f} mm, so forces are wrong near its edges"
         )
     noise_ma = node.noise_counts * node.full_scale_ma / full_scale_counts(node)
     noise_n = _force_of_current(sheet, node, 3 * noise_ma)
     if touch.end_threshold_n < noise_n:
         yield (
-            f"{name}: end_threshold_n = {touch.end_threshold_n}: below the force that noise alone can read, "
+            f"end_threshold_n = {touch.end_threshold_n}: below the force that noise alone can read, "
             f"{noise_n:.3g} N"
+        )
+    limit_n = min(MAX_USUAL_THRESHOLD_N, sheet.max_force_n or math.inf)
+    if touch.begin_threshold_n > limit_n:
+        bound = "max_force_n" if limit_n == sheet.max_force_n else f"{limit_n:g} N"
+        yield (
+            f"begin_threshold_n = {touch.begin_threshold_n}: above {bound}, so most touches aren't noticed; "
+            f"forces are in newtons, and 1 gram-force is {GRAM_FORCE_N:.4f} N"
+        )
+    yield from _electronics_warnings(pad, node, sheet)
+
+
+def _electronics_warnings(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> Iterator[str]:
+    """Warn where the electronics don't fit the sheet, as with a value in another unit."""
+    full_scale_a = 1e-3 * node.full_scale_ma * min(node.channel_scale) / pad.state_count
+    counts = _currents(pad, node, sheet).middle(1.0) / full_scale_a * full_scale_counts(node)
+    hint = (
+        f"check the units of full_scale_ma = {node.full_scale_ma} (mA), drive_v = {node.drive_v} (V), "
+        f"ohm_per_square = {sheet.ohm_per_square} (ohm), contact_ohm_mm2 = {sheet.contact_ohm_mm2} (ohm mm2)"
+    )
+    if counts < MIN_USUAL_COUNTS:
+        yield f"1 N in the pad's middle reads fewer than {MIN_USUAL_COUNTS} counts; {hint}"
+    elif counts > full_scale_counts(node):
+        yield f"1 N in the pad's middle exceeds the full scale of the channels; {hint}"
+    if sheet.ohm_per_square < MIN_USUAL_SHEET_OHM:
+        yield (
+            f"ohm_per_square = {sheet.ohm_per_square}: below {MIN_USUAL_SHEET_OHM} ohm the leads share the "
+            "currents with the sheet; check the unit"
         )
 
 
@@ -172,11 +210,15 @@ def _pad_summary(pad: config.Pad, deployment: config.Deployment) -> dict[str, An
 def _range(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[float, str, float]:
     """Return the force up to which no channel reaches its full scale anywhere on the pad, beside which
     electrode one then does, and the full scale [mA] that the pad needs for `max_force_n`, or any force."""
-    currents = ChannelCurrents(
-        *(pad_network(pad, sheet), pad_surface(pad), contact_law(sheet, law_of(sheet))),
-        *(node.drive_v, sheet.ohm_per_square),
-    )
+    currents = _currents(pad, node, sheet)
     ratio = min(node.channel_scale) / pad.state_count
     force_n, peak = currents.measured_force(1e-3 * node.full_scale_ma * ratio)
     greatest_a = currents.peak(sheet.max_force_n or _ANY_FORCE_N).current_a
     return force_n, pad.electrode_names[peak.electrode], 1e3 * greatest_a / ratio
+
+
+def _currents(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> ChannelCurrents:
+    return ChannelCurrents(
+        *(pad_network(pad, sheet), pad_surface(pad), contact_law(sheet, law_of(sheet))),
+        *(node.drive_v, sheet.ohm_per_square),
+    )
