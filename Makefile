@@ -83,9 +83,11 @@ types: $(VENV)/.dev ## check static types
 docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-tables: $(VENV)/.dev ## write docs/wire.schema.json and the tables of docs/wire.md and docs/firmware.md from the code
+tables: $(VENV)/.dev ## write docs/configuration.md, docs/wire.schema.json and the tables of wire.md and firmware.md from the code
 	$(BIN)/python -m handtouch.wire.tables docs
 	$(BIN)/python -m handtouch.procedures.conformance.page docs
+	@mkdir -p build
+	$(BIN)/python docs/configuration_page.py >build/configuration.md && mv build/configuration.md docs/configuration.md
 
 wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg

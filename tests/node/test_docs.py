@@ -1,4 +1,4 @@
-"""The pages about nodes agree with the code: wiring diagram, keys, kinds of failures."""
+"""The pages about nodes agree with the code: wiring diagram, kinds of failures."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-from pydantic import BaseModel
-
 from handtouch.node.adc_fault import AdcFaultKind, emergency_of
-from handtouch.node.settings import TABLES, Trim, load
+from handtouch.node.settings import load
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/node.md").read_text()
@@ -32,14 +30,6 @@ def test_the_diagram_has_the_channels_gain_and_line_of_the_shipped_node() -> Non
     assert any(str(text).startswith(f"{-pad.gain_ohm:g} Ω") for text in texts)
     assert pad.excitation is not None
     assert f"GPIO {pad.excitation.line}" in texts
-
-
-def test_the_page_has_every_key() -> None:
-    models: list[type[BaseModel]] = [*TABLES.values(), Trim]
-    keys = {field.alias or name for model in models for name, field in model.model_fields.items()}
-    internal = {"sysfs", "devices", "bus", "adc", "pad"}  # of stand-ins; headers of tables
-    assert not [key for key in keys - internal if not re.search(rf"\b{key}\b", PAGE)]
-    assert all(header in PAGE for header in ("`[bus]`", "`[adc.NAME]`", "`[[pad]]`"))
 
 
 def test_the_page_has_every_kind_of_failure_with_its_emcy_message() -> None:

@@ -18,11 +18,15 @@ _MM = 1e-3
 
 
 class _PairedBars(Table):
-    bars: Annotated[int, Field(ge=1, le=50)] = Field(description="bars of one direction, of each field")
-    pitch_mm: Positive = Field(description="distance of neighbouring bars, across them")
-    overlap_mm: Positive = Field(description="overlap of a bar with either of its electrodes at rest")
-    length_mm: Positive = Field(description="length of the electrodes along the bars")
-    gap_mm: Positive = Field(description="gap between the two electrodes under a bar")
+    bars: Annotated[int, Field(ge=1, le=50)] = Field(
+        description="bars of one direction, of each field", examples=[2]
+    )
+    pitch_mm: Positive = Field(description="distance of neighbouring bars, across them", examples=[3.4])
+    overlap_mm: Positive = Field(
+        description="overlap of a bar with either of its electrodes at rest", examples=[0.6]
+    )
+    length_mm: Positive = Field(description="length of the electrodes along the bars", examples=[6.0])
+    gap_mm: Positive = Field(description="gap between the two electrodes under a bar", examples=[0.4])
 
 
 class Bars(_PairedBars):
@@ -51,9 +55,9 @@ class Pinwheel(Table):
     """Four single bars around the centre: both components, and twist."""
 
     kind: Literal["pinwheel"]
-    arm_mm: Positive = Field(description="distance of the bars from the centre")
-    overlap_mm: Positive = Field(description="overlap of a bar with its electrode at rest")
-    length_mm: Positive = Field(description="length of the electrodes along the bars")
+    arm_mm: Positive = Field(description="distance of the bars from the centre", examples=[4.0])
+    overlap_mm: Positive = Field(description="overlap of a bar with its electrode at rest", examples=[0.6])
+    length_mm: Positive = Field(description="length of the electrodes along the bars", examples=[5.0])
 
     def build(self, film_m: float) -> ShearPattern:
         """Return the pattern over a film."""

@@ -75,10 +75,13 @@ def _in_keys_of_the_file(shape: type[Surface], text: str) -> tuple[str, str]:
 def _key_field(key: SurfaceKey) -> tuple[Any, Any]:
     """Return type and pydantic field of a key."""
     number = Annotated[float, Field(gt=key.above, lt=key.below, le=key.at_most)]
+    examples = None if key.example is None else [key.example]
     if key.is_list:
         numbers = Annotated[tuple[number, ...], Field(strict=False, min_length=2)]
-        return numbers, Field(description=key.description)
-    return float, Field(gt=key.above, lt=key.below, le=key.at_most, description=key.description)
+        return numbers, Field(description=key.description, examples=examples)
+    return float, Field(
+        gt=key.above, lt=key.below, le=key.at_most, description=key.description, examples=examples
+    )
 
 
 def _definition(kind: str, shape: type[Surface]) -> type[SurfaceTable]:

@@ -62,12 +62,14 @@ class Daemon(Table):
         min_length=1,
         description="folder of the CURVE keys that TCP clients need (`handtouch keys make`), relative to "
         "this file; default: no keys, so any local client may connect and no other machine can",
+        examples=["keys"],
     )
     store: str | None = Field(
         None,
         min_length=1,
         description="calibration store, relative to this file; default: "
         "$XDG_STATE_HOME/handtouch/calibrations.db, or in the service's state folder",
+        examples=["calibrations.db"],
     )
     supervise: bool = Field(
         True, description="calibrate and diagnose all pads continuously, in a separate supervisor process"
@@ -88,12 +90,13 @@ class Daemon(Table):
     metrics: str | None = Field(
         None,
         description="loopback HOST:PORT of the Prometheus metrics, e.g. 127.0.0.1:9580; default: none",
+        examples=["127.0.0.1:9580"],
     )
     realtime_priority: int = Field(
         0, ge=0, le=99, description="SCHED_FIFO priority of the daemon's main thread; 0: normal scheduling"
     )
     cpus: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
-        (), description="CPUs that the daemon's main thread may run on; default: any"
+        (), description="CPUs that the daemon's main thread may run on; default: any", examples=[(3,)]
     )
     lock_memory: bool = Field(False, description="lock the daemon's memory against swapping (mlockall)")
     busy_poll_us: float = Field(
@@ -123,7 +126,9 @@ class Bus(Table):
         "another NMT master starts them; listener: it sends nothing",
     )
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further options of the python-can interface, passed on unchanged"
+        default_factory=dict,
+        description="further options of the python-can interface, passed on unchanged",
+        examples=[{"port": 43114}],
     )
 
 
@@ -131,7 +136,8 @@ class Idle(Table):
     """`[node.NAME.idle]`: event-driven transmission of an untouched pad, on change instead of with SYNC."""
 
     delta_counts: Annotated[int, Field(ge=1)] = Field(
-        description="change of a channel that makes the node send at once; about five times noise_counts"
+        description="change of a channel that makes the node send at once; about five times noise_counts",
+        examples=[5],
     )
     period_ms: Annotated[int, Field(ge=10, le=65_535)] = Field(
         100, description="event timer of the TPDO (0x1800 + n sub 5): the longest time between two samples"
@@ -149,11 +155,15 @@ class Node(Table):
     """`[node.NAME]`: a kind of sensor node: its identity, channels, electronics and heartbeat."""
 
     eds: str | None = Field(
-        None, description="EDS file, relative to this file; default: the shipped four-channel node"
+        None,
+        description="EDS file, relative to this file; default: the shipped four-channel node",
+        examples=["vendor_node.eds"],
     )
-    vendor_id: Unsigned32 | None = Field(None, description="expected vendor id (0x1018 sub 1); default: any")
+    vendor_id: Unsigned32 | None = Field(
+        None, description="expected vendor id (0x1018 sub 1); default: any", examples=[755]
+    )
     product_code: Unsigned32 | None = Field(
-        None, description="expected product code (0x1018 sub 2); default: any"
+        None, description="expected product code (0x1018 sub 2); default: any", examples=[4]
     )
     channels: Annotated[tuple[str, ...], _PerChannel] = Field(
         ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
@@ -168,18 +178,18 @@ class Node(Table):
         description="send one NMT reset communication to a node that refuses OPERATIONAL; role master only",
     )
     revision: Unsigned32 | None = Field(
-        None, description="expected revision number (0x1018 sub 3); default: any"
+        None, description="expected revision number (0x1018 sub 3); default: any", examples=[65537]
     )
     drive_v: Positive = Field(description="voltage between the conducting layer and the electrodes")
     full_scale_ma: Positive = Field(description="electrode current at full_scale_counts")
     full_scale_counts: Annotated[int, Field(ge=1)] | None = Field(
-        None,
-        description="count at full_scale_ma; default: max_count",
+        None, description="count at full_scale_ma; default: max_count", examples=[32767]
     )
     max_count: Annotated[int, Field(ge=1)] | None = Field(
         None,
         description="greatest count of the converter, 4095 for one of 12 bits: a channel there is saturated; "
         "default: full_scale_counts if that is 2^k or 2^k - 1, else the maximum of the channel's type",
+        examples=[4095],
     )
     channel_scale: PositivePerChannel = Field(
         (1.0, 1.0, 1.0, 1.0),
@@ -197,7 +207,9 @@ class Node(Table):
     )
     idle: Idle | None = Field(None, description="transmission while untouched; default: with every SYNC")
     excitation_object: str | None = Field(
-        None, description="object that switches the pad's excitation: 1 on, 0 off, e.g. 0x2100:0:u8"
+        None,
+        description="object that switches the pad's excitation: 1 on, 0 off, e.g. 0x2100:0:u8",
+        examples=["0x2100:0:u8"],
     )
     heartbeat_ms: int = Field(
         100,
@@ -231,40 +243,57 @@ class Behaviour(Table):
 
     preset: Literal["S1", "S2", "unknown"] = Field(
         "S1",
-        description="sheet of the paper whose values are the defaults of the keys below; unknown: one that "
-        "wasn't measured, with wide intervals of force",
+        description="sheet of the paper whose values are the defaults of keys below that have no other; "
+        "unknown: one that wasn't measured, with wide intervals of force",
     )
     adaptation_share: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        None, description="fraction of a sustained load that adaptation removes"
+        None,
+        description="fraction of a sustained load that adaptation removes; default: the preset's",
+        examples=[0.851],
     )
-    adaptation_time_s: Positive | None = Field(None, description="time constant of adaptation under load")
+    adaptation_time_s: Positive | None = Field(
+        None, description="time constant of adaptation under load; default: the preset's", examples=[3000.0]
+    )
     recovery_time_s: Positive | None = Field(
-        None, description="time constant of recovery with excitation off"
+        None,
+        description="time constant of recovery with excitation off; default: the preset's",
+        examples=[5400.0],
     )
     fatigue_s: Positive | None = Field(
-        None, description="accumulated time under load after which the sheet adapts twice as fast"
+        None,
+        description="accumulated time under load after which the sheet adapts twice as fast; default: the "
+        "preset's, never for S2 and unknown",
+        examples=[10_000.0],
     )
-    threshold_n: NonNegative | None = Field(None, description="least force that the sheet responds to")
+    threshold_n: NonNegative | None = Field(
+        None, description="least force that the sheet responds to; default: the preset's", examples=[0.02]
+    )
     creep_share: Annotated[float, Field(ge=0, lt=1)] | None = Field(
-        None, description="fraction of a reading that arrives by creep"
+        None, description="fraction of a reading that arrives by creep; default: the preset's", examples=[0.4]
     )
-    creep_time_s: Positive | None = Field(None, description="time constant of creep")
+    creep_time_s: Positive | None = Field(
+        None, description="time constant of creep; default: the preset's", examples=[0.25]
+    )
     hysteresis_width: Annotated[float, Field(ge=0, lt=0.4)] = Field(
         0.0,
         description="width of the hysteresis loop at half of hysteresis_full_scale_n, as a fraction of that "
         "force; 0: none",
+        examples=[0.08],
     )
     hysteresis_full_scale_n: Positive = Field(
         5.0, description="greatest load of the measured hysteresis loop"
     )
     press_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        None, description="relative spread between readings of equal presses (1 sigma)"
+        None,
+        description="relative spread between readings of equal presses (1 sigma); default: the preset's",
+        examples=[0.072],
     )
     gain_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None,
         description="relative error of forces on a fresh sheet, common to all presses (1 sigma), where that "
         "of the contact law isn't larger; default: 0.04, that of contact_ohm_std; of an unknown sheet 0.15, "
         "as its hysteresis isn't known",
+        examples=[0.04],
     )
     parameter_std_fraction: Annotated[float, Field(ge=0, le=1)] = Field(
         0.2, description="relative error of the parameters of creep, adaptation and hysteresis (1 sigma)"
@@ -293,12 +322,17 @@ class Sheet(Table):
     contact_ohm_mm2: Positive = Field(description="contact resistance times area at the reference pressure")
     reference_kpa: Positive = Field(100.0, description="pressure at which contact_ohm_mm2 applies")
     alpha: float = Field(gt=0, le=5, description="exponent of pressure in the contact law")
-    contact_radius_mm: Positive = Field(description="radius assumed for a contact")
-    contact_radius_std_mm: NonNegative = Field(description="error of that radius (1 sigma)")
+    contact_radius_mm: Positive = Field(
+        description="radius of a contact, assumed to convert its current to force"
+    )
+    contact_radius_std_mm: NonNegative = Field(
+        description="error of contact_radius_mm (1 sigma), included in the standard deviation of the force"
+    )
     hertz_force_n: Positive | None = Field(
         None,
         description="force at which a contact has contact_radius_mm, which grows as force^(1/3), as under "
         "round objects (Hertz); default: the same radius at every force",
+        examples=[2.0],
     )
     contact_elongation_std: Annotated[float, Field(ge=0, le=2)] = Field(
         0.0,
@@ -357,6 +391,7 @@ class Mount(Table):
         None,
         min_length=1,
         description="link of the URDF that carries the pad; default: the link of the pad's own name",
+        examples=["link_3.0_tip"],
     )
     position_mm: Vector3 = Field((0.0, 0.0, 0.0), description="origin of the pad frame in the link frame")
     rpy_deg: Vector3 = Field((0.0, 0.0, 0.0), description="roll, pitch, yaw about fixed axes, as in URDF")
@@ -393,7 +428,11 @@ class Pad(Table):
     link: Name = Field(description="link that carries the pad; also its name in topics")
     bus: Name = Field(description="name of the [[bus]] that its node is on")
     node_id: NodeId = Field(description="CANopen node id, 1 to 127")
-    serial: Unsigned32 | None = Field(None, description="serial number (0x1018 sub 4) of the pad's node")
+    serial: Unsigned32 | None = Field(
+        None,
+        description="serial number (0x1018 sub 4) of the pad's node, to which its calibration belongs; "
+        "default: any, so a replaced sensor isn't detected",
+    )
     node: Name = Field(description="kind of node, a [node.NAME] table")
     electrodes: Annotated[tuple[Name, ...], _PerChannel] = Field(
         SIDE_ELECTRODES,
@@ -505,10 +544,14 @@ class HandTable(Table):
         None, min_length=1, description="link of the URDF that is the base frame; default: its root"
     )
     joint_names: dict[str, str] = Field(
-        default_factory=dict, description="joint of the URDF -> its name in joint states, where they differ"
+        default_factory=dict,
+        description="joint of the URDF -> its name in joint states, where they differ",
+        examples=[{"joint_1.0": "index_mcp"}],
     )
     joint_prefix: str = Field(
-        "", description="prefix of joint names in joint states, e.g. left_; not applied to joint_names"
+        "",
+        description="prefix of joint names in joint states, e.g. left_; not applied to joint_names",
+        examples=["right_"],
     )
     mount_std_mm: NonNegative = Field(
         0.2,
@@ -516,14 +559,18 @@ class HandTable(Table):
         "palm and base; default: that of printed parts; 0: not included",
     )
     mount_std_deg: NonNegative = Field(
-        0.5, description="orientation error of a mount about each axis (1 sigma), included likewise"
+        0.5,
+        description="orientation error of a mount about each axis (1 sigma), included like mount_std_mm; "
+        "default: that of printed parts",
     )
     joint_std_deg: NonNegative = Field(
         0.2,
         description="error of joint angles, such as their zeros (1 sigma), used where joint states carry no "
         "position_std_rad; included in these covariances; 0: not included",
     )
-    joint_std_mm: NonNegative = Field(0.0, description="the same for prismatic joints")
+    joint_std_mm: NonNegative = Field(
+        0.0, description="error of prismatic joints (1 sigma), used like joint_std_deg"
+    )
     joint_state_timeout_ms: Positive = Field(
         100.0,
         description="positions in palm and base are stale when the nearest joint state is farther in time",
@@ -554,6 +601,7 @@ class SceneRequest(Table):
     rate_hz: Positive | None = Field(
         None,
         description="rate of contact updates; default: one per SYNC. Begin and end are published at once",
+        examples=[50.0],
     )
 
 
@@ -568,6 +616,7 @@ class Scene(SceneRequest):
         description="in a hand untouched for this long, excitation of the sheets that adapt is switched off, "
         "half of them at a time, until another pad is touched: they recover, and detect nothing meanwhile; "
         "default: never",
+        examples=[60.0],
     )
     idle_sync_period_ms: float = Field(
         50.0,

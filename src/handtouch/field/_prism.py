@@ -28,15 +28,22 @@ class PrismSurface(Surface):
     """
 
     kind: ClassVar[str] = "prism"
-    length_m: float = surface_key("length_mm", "along the folds, from electrode x0 to electrode xa")
+    length_m: float = surface_key(
+        "length_mm", "along the folds, from electrode x0 to electrode xa", example=30.0
+    )
     aside_m: tuple[float, ...] = surface_key(
         "section_aside_mm",
         "corners of the cross-section from electrode y0 to electrode yb: coordinate across the pad",
         above=None,
         is_list=True,
+        example=[0.0, 6.0, 18.0, 24.0],
     )
     up_m: tuple[float, ...] = surface_key(
-        "section_up_mm", "height of the same corners; the outside is up", above=None, is_list=True
+        "section_up_mm",
+        "height of the same corners; the outside is up",
+        above=None,
+        is_list=True,
+        example=[0.0, 5.0, 5.0, 0.0],
     )
 
     @np.errstate(all="ignore")

@@ -39,9 +39,13 @@ class RevolutionSurface(SweptSurface):
         "points of the profile from electrode x0 to electrode xa: coordinate along the axis",
         above=None,
         is_list=True,
+        example=[0.0, 10.0, 20.0, 30.0],
     )
     radius_m: tuple[float, ...] = surface_key(
-        "profile_radius_mm", "radii at the same points, joined by a smooth curve", is_list=True
+        "profile_radius_mm",
+        "radii at the same points, joined by a smooth curve",
+        is_list=True,
+        example=[9.0, 11.0, 10.0, 7.0],
     )
     arc_rad: float = arc_key()
 

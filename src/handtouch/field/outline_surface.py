@@ -45,7 +45,9 @@ class OutlineSurface(Surface):
     outline_x_m: tuple[float, ...] = surface_key(
         "outline_x_mm", "x of the outline's vertices, counter-clockwise", above=None, is_list=True
     )
-    outline_y_m: tuple[float, ...] = surface_key("outline_y_mm", "y of them", above=None, is_list=True)
+    outline_y_m: tuple[float, ...] = surface_key(
+        "outline_y_mm", "y of the same vertices", above=None, is_list=True
+    )
     turns_rad: tuple[float, ...] = surface_key(
         "edge_turn_deg",
         "turn of the edge that begins at each vertex: 0 straight, 90 a quarter of a circle, bulging outward, "

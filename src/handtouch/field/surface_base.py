@@ -31,7 +31,7 @@ class SurfaceKey:
     """One key of a surface's table in a deployment file; the ending of its name is its unit, mm or deg.
 
     above, below: exclusive bounds; at_most: inclusive bound, all in the key's unit. is_list: the value is a
-    list of numbers.
+    list of numbers. example: a value for the reference of keys, where no shipped file has one.
     """
 
     name: str
@@ -40,6 +40,7 @@ class SurfaceKey:
     below: float | None = None
     at_most: float | None = None
     is_list: bool = False
+    example: Any = None
 
     def to_si(self, value: Any) -> Any:
         """Return a value of the file, or each of a list, in metres or radians."""
@@ -55,16 +56,20 @@ def surface_key(
     below: float | None = None,
     at_most: float | None = None,
     is_list: bool = False,
+    example: Any = None,
 ) -> Any:
     """Return the dataclass field of a surface whose value a deployment file gives under the key `name`."""
-    key = SurfaceKey(name, description, above, below, at_most, is_list)
+    key = SurfaceKey(name, description, above, below, at_most, is_list, example)
     return dataclasses.field(metadata={"surface_key": key})
 
 
 def arc_key() -> Any:
     """Return the field of the angle around the axis, common to all surfaces of revolution."""
     return surface_key(
-        "arc_deg", "around the axis, from electrode y0 to electrode yb; 360: all round", at_most=360.0
+        "arc_deg",
+        "around the axis, from electrode y0 to electrode yb; 360: all round",
+        at_most=360.0,
+        example=150.0,
     )
 
 

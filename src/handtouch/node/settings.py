@@ -36,7 +36,9 @@ class CanInterface(Table):
     interface: str = Field("socketcan", description="python-can interface: socketcan, udp_multicast …")
     channel: str | int = Field(description="python-can channel, e.g. can0")
     options: dict[str, str | int | float | bool] = Field(
-        default_factory=dict, description="further options of python-can's interface"
+        default_factory=dict,
+        description="further options of python-can's interface",
+        examples=[{"port": 43114}],
     )
 
 
@@ -45,16 +47,21 @@ class Adc(Table):
 
     device: str = Field(
         min_length=1,
-        description="name or label of the device, as in /sys/bus/iio/devices/iio:device*/name, or its folder",
+        description="name or label of the device, as in /sys/bus/iio/devices/iio:device*/name, or its "
+        "folder; two ADCs "
+        "of one type need labels, as numbers such as iio:device0 may change at each boot",
     )
     mode: Literal["one-shot", "buffered"] = Field(
-        "one-shot", description="read in_*_raw at each SYNC, or scans from /dev/iio:deviceN"
+        "one-shot",
+        description="one-shot: read in_CHANNEL_raw of one channel after another at each SYNC; buffered: "
+        "scans from /dev/iio:deviceN",
     )
     trigger: str | None = Field(
         None,
         min_length=1,
         description="name of the trigger of a buffered ADC; one of iio-trig-sysfs starts a conversion at "
         "each SYNC, with any other the ADC runs freely. Default: the driver's own",
+        examples=["adc-trigger"],
     )
     rate_hz: Positive | None = Field(None, description="written to sampling_frequency; default: unchanged")
     buffer_scans: int = Field(256, ge=8, le=65536, description="scans in the kernel's buffer")
@@ -70,7 +77,12 @@ class Excitation(Table):
     chip: str | None = Field(None, min_length=1, description="GPIO chip, e.g. /dev/gpiochip0")
     line: int | None = Field(None, ge=0, le=1023, description="line of the chip")
     active_low: bool = Field(False, description="the excitation is on while the line is low")
-    file: str | None = Field(None, min_length=1, description="file that takes 1 (on) and 0 (off)")
+    file: str | None = Field(
+        None,
+        min_length=1,
+        description="file that takes 1 (on) and 0 (off)",
+        examples=["/sys/class/gpio/gpio17/value"],
+    )
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
@@ -82,9 +94,15 @@ class Excitation(Table):
 class Trim(Table):
     """Trim file of a pad: corrections of its channels, from a measurement with known currents."""
 
-    gain: PerChannel | None = Field(None, description="factors of the currents; default: 1 for each")
+    gain: PerChannel | None = Field(
+        None,
+        description="factors of the currents; default: 1 for each",
+        examples=[(1.004, 0.998, 1.001, 1.0)],
+    )
     offset_ma: PerChannel | None = Field(
-        None, description="currents measured without any, subtracted before the factors; default: 0 for each"
+        None,
+        description="currents measured without any, subtracted before the factors; default: 0 for each",
+        examples=[(0.002, 0.0, -0.001, 0.0)],
     )
 
 
@@ -93,7 +111,9 @@ class NodePad(Table):
 
     name: Name = Field(description="name of the pad in log lines and in the state file")
     node_id: NodeId | None = Field(
-        None, description="node id, until LSS stores another one; default: none, LSS assigns it"
+        None,
+        description="node id, until LSS stores another one; default: none, LSS assigns it (`handtouch "
+        "scan --assign`)",
     )
     serial: Serial | None = Field(
         None, description="serial number, 0x1018 sub 4; default: a random one, kept in the state file"
@@ -109,10 +129,15 @@ class NodePad(Table):
     )
     full_scale_ma: Positive = Field(10.0, description="current at count 32767, as in the deployment")
     trim: str | None = Field(
-        None, min_length=1, description="trim file of the channels, relative to this file"
+        None,
+        min_length=1,
+        description="trim file of the channels, relative to this file",
+        examples=["thumb_tip.trim.toml"],
     )
     excitation: Excitation | None = Field(
-        None, description="output of object 0x2100; default: the excitation is always on"
+        None,
+        description="output of object 0x2100, off before the node boots and after the program ends; "
+        "default: the excitation is always on",
     )
 
     @model_validator(mode="after")
@@ -137,6 +162,7 @@ class TouchNode(Table):
         min_length=1,
         description="file of node ids and serial numbers, relative to this file; default: FILE.state.json, "
         "or in the service's state folder",
+        examples=["node.state.json"],
     )
     event_sample_ms: float = Field(
         5.0, ge=1, le=1000, description="period of samples while TPDOs are event-driven"
@@ -146,7 +172,7 @@ class TouchNode(Table):
     )
     realtime_priority: int = Field(0, ge=0, le=99, description="SCHED_FIFO priority; 0: normal scheduling")
     cpus: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
-        (), description="CPUs that the node may run on; default: any"
+        (), description="CPUs that the node may run on; default: any", examples=[(3,)]
     )
     lock_memory: bool = Field(False, description="lock the memory against swapping (mlockall)")
     sysfs: str = Field(
