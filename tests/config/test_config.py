@@ -691,6 +691,7 @@ def test_two_multicast_buses_need_different_ports() -> None:
 names = st.from_regex(r"[A-Za-z][A-Za-z0-9_\-]{0,8}", fullmatch=True)
 lengths = st.floats(1.0, 100.0)
 arcs = st.floats(10.0, 360.0)
+whole_degrees = st.integers(-180, 180).map(float)  # no multiple of 45 degrees in radians, which is refused
 any_text = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 any_value = st.recursive(
     st.booleans()
@@ -737,7 +738,7 @@ def deployments(draw: st.DrawFn) -> dict[str, Any]:
             "surface": draw(surfaces()),
             "gap_mm": draw(st.floats(0.02, 0.03)),
             "series_ohm": draw(st.lists(st.floats(0.0, 1e4), min_size=4, max_size=4)),
-            "mount": {"rpy_deg": draw(st.lists(st.floats(-180, 180), min_size=3, max_size=3))},
+            "mount": {"rpy_deg": draw(st.lists(whole_degrees, min_size=3, max_size=3))},
         }
         for link, node_id in zip(links, ids, strict=True)
     ]

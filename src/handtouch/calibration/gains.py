@@ -49,15 +49,14 @@ those of other gains or objects."""
 _MAX_BATCH_ITERATIONS = 8
 _CONVERGED_STEP_SIGMA = 0.02  # standard deviations of the gains: a smaller step ends a batch
 _L1_ITERATIONS, _EM_ITERATIONS = 12, 20
-_MIN_EDGE_DISTANCE_FRACTION = (
-    0.05  # of a side: nearer to an edge, a contact of real size is no point of the model
-)
-_MAX_NOISE_FRACTION = 0.02  # of the total: weaker contacts hold little information, with a bias
+_MIN_EDGE_DISTANCE_FRACTION = 0.05
+"""Distance over a side: nearer to an edge, a contact of real size is no point of the model."""
+_MAX_NOISE_FRACTION = 0.02  # noise over the total: weaker contacts hold little information, with a bias
 _CELLS_PER_SIDE = 10  # a side
 _MEMORY_CONTACTS = 128.0  # contacts over which the share of points is estimated
 _MIN_OUTLIER_VARIANCE = 25.0  # variance of the scores of contacts that are no points, at least
-_MIN_INFORMATION_FRACTION = 0.2  # of a batch's information, however unlikely its contacts
-_MEDIAN_SQUARED_SCORE = 0.4549  # of a standard normal number
+_MIN_INFORMATION_FRACTION = 0.2  # part of a batch's information that counts, however unlikely its contacts
+_MEDIAN_SQUARED_SCORE = 0.4549  # median of the square of a standard normal number
 _DAY_NS = 86_400e9
 
 

@@ -110,7 +110,7 @@ def run(
         deployment = lower_rate(deployment, model)
         file = scenario_path or (None if config_path else shipped.path(DEFAULT_SCENARIO))
         scenario = _scenario(deployment, file, grasp=grasp, world=hidden, repeat=view)
-    except ValueError as error:  # of a file, or of an impossible grasp
+    except ValueError as error:  # an error in a file, or an impossible grasp
         print(error, file=sys.stderr)
         return 2
     endless = view and seconds is None

@@ -16,8 +16,8 @@ from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
 
 _MAX_LOAD = 0.25
-"""Of a period, for solving contacts; the simulated hand and the view share the interpreter."""
-_MAX_PERIOD_MS = 1000.0  # of a deployment
+"""Part of a period for solving contacts; the simulated hand and the view share the interpreter."""
+_MAX_PERIOD_MS = 1000.0  # longest period that a deployment may state
 _TRIALS = 5
 _CONTACT_RADII = 10.0  # current of a trial's contacts, in thresholds of detection
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from handtouch.design import DesignResult, ElectrodeLayout, PadTask, Statistic
 
 _COLUMNS = ("electrode", "from, mm", "to, mm", "then bare", "series, ohm")
-_CHECK_SEED = 0  # of the deployment's tolerances, which don't depend on it
+_CHECK_SEED = 0  # any seed: it draws the deployment's tolerances, on which the result doesn't depend
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,7 @@ class Robot:
 
     def __init__(self, endpoint: str = INPUTS_ENDPOINT, key: Path | str | None = None) -> None:
         self.endpoint = endpoint
-        self._hands: frozenset[str] = frozenset()  # of the connected daemon
+        self._hands: frozenset[str] = frozenset()  # hands of the connected daemon
         options = {zmq.SNDHWM: _QUEUE_MESSAGES, zmq.LINGER: _LINGER_MS, **RECONNECT_OPTIONS}
         options[zmq.XPUB_VERBOSE] = 1  # report also what a daemon before a restart had subscribed to
         self._connection = Connection.open(zmq.XPUB, endpoint, key, options)

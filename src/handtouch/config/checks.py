@@ -31,7 +31,7 @@ from handtouch.field.outline_surface import OutlineSurface
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
 _SURFACES_ABOVE_SHEAR = ("plane", "cylinder", "cone", "sphere", "revolution")
-_MAX_OVERLAP_MM = 1e-6  # of arcs that end in one point: rounding
+_MAX_OVERLAP_MM = 1e-6  # rounding where arcs end in one point
 
 
 def problems_in(deployment: Deployment) -> Iterator[Problem]:

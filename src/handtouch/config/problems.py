@@ -157,7 +157,7 @@ class _ValidationMistake:
             remedy += f", without quotes: write {given}"
         if self.error_type == "tuple_type" and isinstance(self.error["input"], dict):
             return Problem(f"[{self.key}]", "", f"must be a list of tables: write [[{self.key}]]")
-        if self.error_type == "value_error":  # of a whole table; the message is complete
+        if self.error_type == "value_error":  # error of a whole table; the message is complete
             return Problem(self.location, "", remedy)
         if self.error_type == "model_type":
             remedy = "must be a table of keys"

@@ -46,7 +46,7 @@ def pad_unit_problems(location: str, pad: Pad) -> Iterator[Problem]:
     lengths = {key: value for key, value in surface.items() if key.endswith("_mm")}
     together = {key for key in lengths if isinstance(lengths[key], tuple) or "_radius_" in key}
     for key, value in lengths.items():
-        # of a profile or a cone, single radii may be small
+        # single radii of a profile or a cone may be small
         greatest = (
             max((_greatest(lengths[other]) for other in together), default=0.0) if key in together else 0.0
         )

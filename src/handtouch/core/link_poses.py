@@ -75,7 +75,7 @@ def _joint_tree(hand: HandKinematics) -> JointTree:
     kinds = np.array([_KINDS.get(joint.kind, 0) for joint in hand.tree], dtype=np.intp)
     motions = np.zeros((t, 33))
     for motion, joint in zip(motions, hand.tree, strict=True):
-        cross = np.cross(joint.axis, np.eye(3)).T  # of the axis with a vector, as a matrix
+        cross = np.cross(joint.axis, np.eye(3)).T  # cross product of the axis with a vector, as a matrix
         turned = joint.rotation, joint.rotation @ cross, joint.rotation @ cross @ cross
         motion[:] = np.concatenate([*map(np.ravel, turned), joint.translation_m, joint.axis])
     return JointTree(

@@ -50,9 +50,9 @@ _SHEET_TOLERANCES = {
 }
 
 
-_UNLIMITED_FORCE_N = 1e3  # of a sheet without max_force_n: its current is the sheet's maximum
+_UNLIMITED_FORCE_N = 1e3  # force of a sheet without max_force_n: its current is the sheet's maximum
 _MIN_RADIUS_RATIO = 0.3  # least radius of a contact, relative to the stated one
-_DEAD_WEIGHT = 1e-6  # of a dead electrode, whose readings are left out
+_DEAD_WEIGHT = 1e-6  # weight of a dead electrode, whose readings are left out
 _LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistance, per wave's: a sum of five
 
 

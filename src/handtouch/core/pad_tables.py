@@ -35,25 +35,25 @@ FloatArray = NDArray[np.float64]
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
 CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 0.9 MB
-_TOLERANCE_STEP = 3e-5  # of differences, in sides
-_PATCH_STEP = 0.02  # of second differences: currents of a patch vary no faster
+_TOLERANCE_STEP = 3e-5  # step of differences, in sides
+_PATCH_STEP = 0.02  # step of second differences: currents of a patch vary no faster
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
 """Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
 SEARCH_POINTS = 9
 MIN_PAIR_ELECTRODES = 6
 _BISECTIONS = 60
-_MIN_EDGE_DISTANCE = 1e-6  # of a side
-_MIN_RADIUS_DISTANCE = 1e-3  # of a side: the spreading radius vanishes at an edge
+_MIN_EDGE_DISTANCE = 1e-6  # distance over a side
+_MIN_RADIUS_DISTANCE = 1e-3  # distance over a side: the spreading radius vanishes at an edge
 _SURFACE_CELLS = (8, 16, 32, 64)
 _MAX_SURFACE_ERROR = 1e-7
-"""Of a pad's size, between the nodes."""
+"""Error between the nodes over a pad's size."""
 _STACK_INTERVALS = 2048
 _MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
 _MIN_LOG_X2, _MAX_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1 / 16
 FORCE_NODES = 12
-"""Of the quadrature over ln x^2. Beside 96 nodes, on 3,703 contacts of random sheet, law, radius, current and
-place, up to the maximum current, forces are within 0.05 of their standard deviation (99 %: 0.007), and that
-within 9 % (99 %: 1 %); with 8 nodes within 0.14 and 9 % (99 %: 0.03 and 2 %)"""
+"""Nodes of the quadrature over ln x^2. Beside 96 nodes, on 3,703 contacts of random sheet, law, radius,
+current, place, up to the maximum current, forces are within 0.05 of their standard deviation (99 %: 0.007),
+and that within 9 % (99 %: 1 %); with 8 nodes within 0.14 and 9 % (99 %: 0.03 and 2 %)"""
 NEAR_FORCE_NODES = 5
 """The same where the force is nearly log-normal: beside 64 nodes, on 5,585 such contacts of 26,047 of random
 sheet, law, radius, current and place, forces are within 0.01 of their standard deviation, that within 2 %"""
@@ -292,7 +292,7 @@ def _tabulate_tolerances(
     for number, end in enumerate(ends):
         step = _TOLERANCE_STEP * (network.a, network.b)[end.axis]
         by_end = slope(network.with_moved_end(number, step), step)
-        for state, electrodes in enumerate(states):  # of rank 1: other states have other singularities
+        for state, electrodes in enumerate(states):  # rank 1; the singularities differ between states
             own = by_end[list(electrodes)].reshape(len(electrodes), -1)
             left, singular, right = np.linalg.svd(own, full_matrices=False)
             vectors[number, list(electrodes)] = left[:, 0] * singular[0]

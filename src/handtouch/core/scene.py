@@ -25,7 +25,7 @@ MAX_CLIENTS = 32
 PATTERNS_PER_PAD = 2
 """Most patterns of one request, for each pad of the deployment"""
 MAX_CLIENT_CHARACTERS = 32_768
-"""Of the patterns of all clients' scenes together, which every answer contains"""
+"""Length of the patterns of all clients' scenes together, which every answer contains"""
 WILDCARDS = frozenset("*?[")
 BoolArray = NDArray[np.bool_]
 PadName = tuple[str, str]

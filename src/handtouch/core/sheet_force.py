@@ -30,15 +30,15 @@ UPDATE_PERIOD_S = 0.1
 _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
-_MAX_FORCE_STD_FRACTION = 1.0  # of the force: above it, the force is invalid
+_MAX_FORCE_STD_FRACTION = 1.0  # deviation over the force: above it, the force is invalid
 _GAIN_STD, _UNKNOWN_GAIN_STD = 0.04, 0.15
-"""Of sheets that were measured, by contact_ohm_std / alpha; of one that wasn't: its loops, too."""
+"""Relative errors of measured sheets, contact_ohm_std / alpha, and of one that wasn't: its loops, too."""
 _HOUR_S = 3600.0
 _LOG_GAIN_STD_PER_HOUR = 0.05
 _MAX_LOG_GAIN_RATE_PER_S = 0.02
 _OUTLIER_SIGMA = 4.0
 _MAX_REFERENCE_OFFSET_NS = 50_000_000  # between a reference and the sample it is compared with
-_MIN_CONTACT_AGE_S = 1.0  # of a contact that is compared with a reference
+_MIN_CONTACT_AGE_S = 1.0  # age of a contact that is compared with a reference
 _OF_PAD = (
     "compensated_force_n",
     "compensated_std_n",

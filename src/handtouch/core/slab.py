@@ -80,9 +80,11 @@ class Slab:
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
         self._single = bytearray(size)  # 1 where a sample is one PDO
-        self._partial_samples: dict[int, _PartialSample | _ScheduledSample] = {}  # of pads with several PDOs
+        self._partial_samples: dict[
+            int, _PartialSample | _ScheduledSample
+        ] = {}  # unfinished samples of pads with several PDOs
         self._fields = np.zeros((size, channels, receive.FIELD_WORDS), dtype=np.int64)
-        self._counts_per_unit = np.zeros((size, channels))  # of REAL32 fields, 0 for integers
+        self._counts_per_unit = np.zeros((size, channels))  # scale of REAL32 fields, 0 for integers
         self._is_real: NDArray[np.bool_] | None = None
         self._low_limits = np.zeros((size, channels), dtype=np.int64)
         self._high_limits = np.zeros((size, channels), dtype=np.int64)

@@ -27,7 +27,7 @@ from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
 VERSION = 2
-"""Of what the fields mean; their names, types and shapes are in the hash of the layout."""
+"""Version of the fields' meanings; their names, types and shapes are in the hash of the layout."""
 SHEET_ELEMENTS = SHEET_PLAYS = 8
 _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9

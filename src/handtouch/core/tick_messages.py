@@ -38,7 +38,7 @@ _UINT32_END = 1 << 32
 _COUNTER_KEYS = "seq", "t_ns", "tick"
 _CHANGING_KEYS = *_COUNTER_KEYS, "retained"
 _INT, _LONG = struct.Struct(">I"), struct.Struct(">Q")
-_TRUE, _FALSE = b"\xc3", b"\xc2"  # of msgpack
+_TRUE, _FALSE = b"\xc3", b"\xc2"  # bytes of msgpack
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
 _MIN_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
@@ -75,7 +75,7 @@ class TickMessages:
         self._session = session
         self._state = tick.state
         self._contact_encoder = ContactMessageEncoder(model, tick, session)
-        self._end_reason: EndReason = ""  # of all contacts, when the daemon stops
+        self._end_reason: EndReason = ""  # reason for the end of all contacts, when the daemon stops
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]

@@ -46,7 +46,7 @@ _log = logging.getLogger("handtouch.control")
 PadPattern = Annotated[str, Field(max_length=129)]
 """Hand, slash and link, each of up to 64 characters"""
 _MAX_WILDCARDS = 20
-"""Of a request's patterns: each costs the loop up to 0.1 ms where they are sets, so that all cost 2 ms"""
+"""Wildcards in a request's patterns: a set costs the loop up to 0.1 ms, so that all cost 2 ms at most"""
 PadPatterns = Annotated[tuple[PadPattern, ...], Field(strict=False, min_length=1, max_length=1000)]
 ClientName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
 CalibrationId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]

@@ -18,7 +18,7 @@ _SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_MEMINFO = 26, 27, 55  # not in Python'
 _MEMINFO_FORMAT = "9I"  # the last: packets that the socket has dropped
 
 Instruction = tuple[int, int, int, int]
-"""Of a socket filter (classic BPF): code, jump if true, jump if false, operand"""
+"""Instruction of a socket filter (classic BPF): code, jump if true, jump if false, operand"""
 _LOAD_BYTE, _LOAD_WORD, _AND, _JUMP_IF_EQUAL, _RETURN = 0x30, 0x20, 0x54, 0x15, 0x06
 _TCP_FLAGS, _SYN_ACK, _SYN = 13, 0x12, 0x02
 _RANDOM = 0xFFFFF000 + 56

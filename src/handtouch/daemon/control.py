@@ -103,7 +103,7 @@ class ControlServer:
         self.refused = 0
         self._authenticator, self._socket, self._clock = authenticator, socket, clock
         self._running: list[_RunningJob] = []
-        self._parts: list[zmq.Frame] = []  # of the message that is being read
+        self._parts: list[zmq.Frame] = []  # parts of the message that is being read
         self._saved_ns = float(_MAX_SAVED_NS)
         self._saved_at_ns = 0
 

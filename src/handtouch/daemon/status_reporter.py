@@ -117,7 +117,7 @@ class StatusReporter:
         self._shear_channels = ShearChannels()
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
-        self._logged_problems = dict.fromkeys(ports, "")  # of each bus, without digits
+        self._logged_problems = dict.fromkeys(ports, "")  # last problem of each bus, without digits
 
     def record_tick(self, from_ns: int, to_ns: int) -> None:
         """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`."""

@@ -22,7 +22,7 @@ from handtouch.design.layout import RING_OF_SIDES, ElectrodeLayout
 from handtouch.design.pad_task import PadTask
 from handtouch.field.outline_surface import OutlineSurface
 
-_DIGITS = 4  # of lengths in mm
+_DIGITS = 4  # digits of lengths in mm
 _OUTLINED = {"plane": "outline", "cylinder": "outline_on_cylinder"}
 """Kinds of surfaces that are also pads with a rectangular outline"""
 _FILES_OF_HANDS, _FILES_OF_NODES, _FILES_OF_DAEMON = ("urdf",), ("eds",), ("keys", "store")
@@ -169,6 +169,6 @@ def _write_arcs(document: Any, table: Any, task: PadTask, pad: config.Pad) -> No
     if pad.node in document["node"]:
         return
     node = copy.deepcopy(document["node"][task.pad.node].unwrap())
-    for key in ("eds", "channel_scale", "idle"):  # of as many channels as the node had
+    for key in ("eds", "channel_scale", "idle"):  # have as many entries as the node has channels
         node.pop(key, None)
     document["node"][pad.node] = node | {"channels": _channels(task.node.channels, len(arcs))}

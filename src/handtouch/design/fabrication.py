@@ -26,7 +26,7 @@ MARGIN_MM = 3.0
 _TRACE_MM, _PITCH_MM = 0.8, 1.6
 _CONNECTOR_PITCH_MM, _CONNECTOR_PAD_MM = 2.54, (4.0, 1.6)
 _TAIL_MM = 12.0  # from the frame to the connector
-_CUT_MM = 1.2  # of film outside the outermost tail
+_CUT_MM = 1.2  # film outside the outermost tail
 
 
 def electrode_names(task: PadTask, layout: ElectrodeLayout) -> list[str]:

@@ -18,7 +18,7 @@ from handtouch.field.perimeter_network import perimeter_point
 
 FloatArray = NDArray[np.float64]
 
-_MAX_MITRE = 2.0  # of an offset at a corner
+_MAX_MITRE = 2.0  # length of a mitre over the offset, at a corner
 _BOUNDARY_STEPS = 240
 
 

@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 RING_OF_SIDES = ("y0", "xa", "yb", "x0")
 """Sides in the order of the boundary; the higher end of yb and x0 comes first."""
-_STEPS = 400  # of each side, between which lengths are interpolated
+_STEPS = 400  # steps of each side, between which lengths are interpolated
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91, 100)
 _MIN_RESISTOR_OHM = 5.0  # a smaller one is left out
 

@@ -26,10 +26,10 @@ FloatArray = NDArray[np.float64]
 
 _STARTS_ANYWHERE = 3
 _ITERATIONS = 60
-_STEP = 1e-5  # of differences, in variables of order 1
-_ENOUGH = 1e-6  # of the logarithm of the goal: an iteration that gains less is the last
+_STEP = 1e-5  # step of differences, in variables of order 1
+_ENOUGH = 1e-6  # gain in the logarithm of the goal: an iteration that gains less is the last
 _FAILED = 20.0  # logarithm of the goal of an impossible layout
-_FINE_POINTS = 17  # of a side, for values that are reported
+_FINE_POINTS = 17  # points of a side, for values that are reported
 _MAX_LOG_SHARE = 3.0
 
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FloatArray = npt.NDArray[np.float64]
-_MAP_EDGE_FRACTION, _MAP_STEPS = 0.02, 61  # of the map
+_MAP_EDGE_FRACTION, _MAP_STEPS = 0.02, 61  # margin of the map, and its points per side
 
 
 def draw_map(pad: PadDesign) -> Figure:

@@ -33,7 +33,7 @@ class PartTolerances:
     contact_ohm: float = 0.0
     alpha: float = 0.0
     radius: float = 0.0
-    """Of the contact's radius, relative; it differs from touch to touch."""
+    """Relative spread of the contact's radius, which differs from touch to touch."""
 
     @classmethod
     def from_tables(cls, pad: config.Pad, node: config.Node, sheet: config.Sheet) -> PartTolerances:

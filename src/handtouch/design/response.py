@@ -21,8 +21,8 @@ from handtouch.field import ContactLaw, PerimeterNetwork
 
 FloatArray = NDArray[np.float64]
 
-_POSITION_STEP = 1e-4  # of the shorter side, of differences
-_FORCE_STEP = 1e-3  # of the force
+_POSITION_STEP = 1e-4  # step of differences over the shorter side
+_FORCE_STEP = 1e-3  # step of differences over the force
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ Shares = Callable[[FloatArray, FloatArray], FloatArray]
 CHECKED_GOALS = ("position", "linearity", "two-contacts")
 _RING = [2, 1, 3, 0]  # channels y0, xa, yb, x0 of the simulator's x0, xa, y0, yb
 _ITERATIONS = 3
-_NOISE_SAMPLES = 25  # of each drawn pad
+_NOISE_SAMPLES = 25  # samples of each drawn pad
 _DIRECTIONS_RAD = np.arange(4) * np.pi / 4
 
 
@@ -121,7 +121,7 @@ def _pair_squares(
     separation = goal.compute(task, layout)
     scale = np.sqrt(np.prod(task.surface.scales(x, y), axis=0))
     near = np.minimum(np.minimum(x, task.surface.a - x), np.minimum(y, task.surface.b - y))
-    tried = np.minimum(separation / scale, near)  # of the pair on the rectangle, within the pad
+    tried = np.minimum(separation / scale, near)  # the pair's distance on the rectangle
     alone, weights, scores = shares(x, y).T, misfit_weights(response), np.zeros(len(x))
     for angle in _DIRECTIONS_RAD:
         half_x, half_y = tried / 2 * np.cos(angle), tried / 2 * np.sin(angle)

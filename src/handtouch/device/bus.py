@@ -31,7 +31,7 @@ their addition, one column per electrode of the node that has most, int64 or nar
 of a node's object are clipped.
 """
 
-_COUNT_BYTES, _SAMPLE_BYTES = 2, 2 * CHANNELS  # of the standard layout: int16
+_COUNT_BYTES, _SAMPLE_BYTES = 2, 2 * CHANNELS  # bytes of the standard layout: int16
 _MIN_INT16, _MAX_INT16 = np.int64(-32768), np.int64(32767)
 _MAX_WAIT_S = 0.1  # so that `stop` is prompt
 _MAX_DISCARDED_FRAMES = 100_000  # so that constant traffic doesn't delay the start
@@ -67,7 +67,7 @@ class DeviceBus:
         self._unconfigured: list[UnconfiguredDevice] = []
         self._rows = 0
         self._scheduler = Scheduler()
-        self._next_sample_ns = 0  # of event-driven nodes
+        self._next_sample_ns = 0  # next sample of event-driven nodes
         self._counts: NDArray[np.signedinteger[Any]] = np.zeros((0, CHANNELS), np.int64)
         self._count_lists: list[list[int]] | None = None  # the same, made on demand
         self._changed = True

@@ -29,7 +29,7 @@ _NO_CHANGE, _STOPS = 1, 2
 _ERROR_REGISTER, _EMCY_COB_ID = (cia301.ERROR_REGISTER, 0), (cia301.EMCY_COB_ID, 0)
 _LIFE_GUARD_ERROR = 0x8130
 _HISTORY_LENGTH = 8
-_MAX_BACKLOG_NS = 100_000_000  # of a babbling node, after a pause of the program
+_MAX_BACKLOG_NS = 100_000_000  # backlog of a babbling node, after a pause of the program
 
 
 class DeviceHost(Protocol):

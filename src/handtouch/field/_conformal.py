@@ -18,14 +18,14 @@ import numpy as np
 from handtouch.field.outline import ComplexArray, FloatArray, Outline
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 
-_TOLERANCE = 1e-7  # of the fit, of the outline's larger extent
+_TOLERANCE = 1e-7  # error of the fit over the outline's larger extent
 _MAX_ERROR = 1e-5
 _MAX_DEGREE = 100
 _NETWORK_TOLERANCE = 1e-6
-_EDGE_DISTANCE = 1e-9  # of the longer side: of points from the rectangle's edges, and between fitted points
+_EDGE_DISTANCE = 1e-9  # distance of points from the edges, and of fitted points, over the longer side
 _START_POINTS = 33
 _NEWTON_STEPS = 40
-_MAX_NEWTON_STEP = 0.1  # of the shorter side
+_MAX_NEWTON_STEP = 0.1  # step over the shorter side
 
 
 class ConformalRectangle:

@@ -97,7 +97,7 @@ class GroundedElectrodes(ABC):
         """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f by S[:, j] f[j]."""
         drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
         drop = np.where(np.isfinite(drop), drop, 0.0)
-        if not drop.any():  # of electrodes that touch, the conductance is infinite
+        if not drop.any():  # between electrodes that touch, the conductance is infinite
             return np.zeros_like(self._mix)
         return -self._mix @ self.conductance * drop
 

@@ -24,11 +24,10 @@ from handtouch.field.contact_stack import stack_factor, stack_inverse
 
 FloatArray = npt.NDArray[np.float64]
 
-MAX_CURRENT_FRACTION = 0.98  # of the greatest current the sheet can carry: beyond it a force is a lower bound
+MAX_CURRENT_FRACTION = 0.98  # current over the sheet's maximum: beyond it a force is a lower bound
 BOUND_SIGMA = 2.0  # standard deviations
-MIN_SPREADING_RATIO = (
-    2.0  # spreading over contact radius; nearer an edge the sheet's resistance is taken as here
-)
+MIN_SPREADING_RATIO = 2.0
+"""Spreading over contact radius; nearer an edge the sheet's resistance is taken as here."""
 _MIN_LOG_SPREADING_RATIO = float(np.log(MIN_SPREADING_RATIO))
 _MIN_CURRENT_A = 1e-200
 
@@ -72,7 +71,7 @@ class ForceEstimateStatus(IntEnum):
     BELOW_THRESHOLD = 2  # within the noise, or below the threshold of useful response
     INVALID = 3  # an input was NaN, or no contact carries such a current
     WIDE = (
-        4  # of the daemon: the current leaves the force open within a factor of three or more, as in corners
+        4  # the daemon's: the current leaves the force open within a factor of three or more, as in corners
     )
 
 

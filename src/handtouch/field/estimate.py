@@ -15,15 +15,15 @@ BoolArray = NDArray[np.bool_]
 
 _MAX_STEPS = 40
 MAX_SETTLED_DECREMENT = 1e-6  # squared Newton decrement, in variances: the last step leaves far less
-_MIN_STEP = 1e-14  # of a side
-_MIN_EDGE_DISTANCE = 1e-9  # of a side, of an estimate from an edge
-MAX_STEP = 0.5  # of the shorter side: the range over which the currents are nearly exponential
+_MIN_STEP = 1e-14  # step over a side
+_MIN_EDGE_DISTANCE = 1e-9  # distance of an estimate from an edge, over a side
+MAX_STEP = 0.5  # step over the shorter side: the range over which the currents are nearly exponential
 MAX_STD_SIDES = 1e3  # a coordinate with a larger deviation is reported as unknown
 CORNER_RADIUS_FACTOR = 0.7
 """Radius about a corner within which currents carry no information, in shorter sides times the root of the
 relative noise."""
-_ARC_ITERATIONS = 6  # of the search for the direction from a corner
-_MIN_CORNER_ANGLE_RAD = 0.02  # of an estimate near a corner from its sides
+_ARC_ITERATIONS = 6  # steps of the search for the direction from a corner
+_MIN_CORNER_ANGLE_RAD = 0.02  # angle between a side and an estimate near a corner
 _GUESS_BATCH = 8192  # contacts at once, to bound memory
 _GUESS_GRID = 9  # points per side of the search for a start
 

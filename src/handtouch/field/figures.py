@@ -32,7 +32,7 @@ DPI = 150
 UNIT = Rectangle(1.0, 1.0)
 SHEET_OHM = 2400.0  # the paper's conducting polymer, ohm per square
 SQUARE_M, GAP_M = 0.125, 0.007  # side of the large square; bare length at its corners
-PLUG_OHM = 200.0  # of contact under the banana plug, as assumed by the paper
+PLUG_OHM = 200.0  # contact resistance under the banana plug, as assumed by the paper
 RESISTOR_OHM = 336.0
 
 

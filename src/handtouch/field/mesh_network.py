@@ -21,7 +21,7 @@ from handtouch.field.model import FloatArray
 IntArray = npt.NDArray[np.intp]
 Point3 = tuple[float, float, float]
 
-_MERGED = 1e-6  # of the extent: vertices closer than that are one
+_MERGED = 1e-6  # distance of vertices that are one, over the extent
 _STL_HEADER = 84
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _INSIDE = -1e-9

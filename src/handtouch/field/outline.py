@@ -19,7 +19,7 @@ ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
 Point = tuple[float, float]
 
-MIN_CLEARANCE = 1e-4  # of the outline's larger extent: shortest edge, and distance of separate edges
+MIN_CLEARANCE = 1e-4  # shortest edge, and distance of separate edges, over the outline's larger extent
 _MIN_CORNER_RAD = 0.05  # interior angle at a corner, and its distance from a full turn
 _CHECK_POINTS = 65  # per edge, for crossings and clearances
 _LENGTH_NODES = 32

@@ -23,8 +23,8 @@ from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.outline import MIN_CLEARANCE, ComplexArray, FloatArray, Outline
 
 _SMOOTH_ANGLE_RAD = 1e-9
-_MAX_IMAGE_DISTANCE = 0.5  # of the larger extent: of a point from its mirror image
-_MIN_IMAGE_CLEARANCE = 0.5  # of a mirror image from the boundary, in distances of its source
+_MAX_IMAGE_DISTANCE = 0.5  # distance of a point from its mirror image, over the larger extent
+_MIN_IMAGE_CLEARANCE = 0.5  # distance of a mirror image from the boundary over that of its source
 _ORIGIN_ROUNDING = 1e-9
 
 
@@ -205,7 +205,7 @@ class OutlineNetwork(GroundedElectrodes):
             [edges[i].reflection(at, w) for i, at, w in zip(nearest, s, z, strict=True)], np.complex128
         )
         bare = np.array([piece.electrode < 0 for piece in self._pieces])
-        clear = np.full(z.size, np.inf)  # of images from the boundary
+        clear = np.full(z.size, np.inf)  # distance of the images from the boundary
         for edge in dict.fromkeys(edges):
             clear = np.minimum(clear, np.abs(edge.point(edge.nearest_parameter(image)) - image))
         used = (np.abs(image - z) < _MAX_IMAGE_DISTANCE) & (clear > _MIN_IMAGE_CLEARANCE * best)

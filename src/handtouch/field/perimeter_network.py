@@ -18,7 +18,7 @@ from handtouch.field.rectangle_network import ElectrodeEnd, RectangleNetwork
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
-_CENTRE_POINTS = 64  # of an electrode, whose mean is its centre
+_CENTRE_POINTS = 64  # points of an electrode, whose mean is its centre
 
 
 class PerimeterNetwork(RectangleNetwork):

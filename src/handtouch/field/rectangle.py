@@ -19,8 +19,8 @@ from handtouch.field.model import FloatArray
 MAX_ASPECT_RATIO = 1e100
 _HALF_PI = math.pi / 2
 _MAX_UNSCALED_SIDE = 1e100  # sides within this factor of 1 need no scaling against overflow
-_MIN_EDGE_DISTANCE = 1e-300  # of a side: closer points are on the edge
-_MIN_DERIVATIVE_DISTANCE = 1e-140  # of a side: derivatives of closer points are taken here
+_MIN_EDGE_DISTANCE = 1e-300  # distance over a side: closer points are on the edge
+_MIN_DERIVATIVE_DISTANCE = 1e-140  # distance over a side: derivatives of closer points are taken here
 
 
 @dataclass(frozen=True)

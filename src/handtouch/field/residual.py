@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from handtouch.field.estimate import BoolArray, PointEstimate, estimate
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
-_DIFFERENCE_STEP = 1e-4  # of the distance to the nearest edge: step of the second derivatives
+_DIFFERENCE_STEP = 1e-4  # step of the second derivatives over the distance to the nearest edge
 _BISECTIONS = 24
 
 

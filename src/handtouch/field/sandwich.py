@@ -24,9 +24,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 _GRID_POINTS, _MAX_STEPS = 33, 40
 _LOG_RADIUS_TOLERANCE = 1e-10
-_MIN_STACK_FRACTION = (
-    1 / MAX_CURRENT_FRACTION - 1
-)  # of the rest of the resistance: below, the contact's part doesn't determine a force
+_MIN_STACK_FRACTION = 1 / MAX_CURRENT_FRACTION - 1
+"""Least part of the contact over the rest of the resistance that determines a force."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ _BOLTZMANN_J_K, _ROOM_K = 1.380649e-23, 300.0
 OUTPUT_V = 2.5
 """Output of an amplifier at full scale, either side of the virtual ground."""
 BANDWIDTH_HZ = 10e3
-"""Of the amplifier; the converter averages over it."""
+"""Bandwidth of the amplifier; the converter averages over it."""
 AMPLIFIER_V_RTHZ = 10e-9
 _STEPS = 15
 

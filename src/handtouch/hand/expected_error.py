@@ -25,7 +25,7 @@ from handtouch.hand import electrode_network, pad_surface
 FloatArray = npt.NDArray[np.float64]
 
 FIRM_TOUCH_N = 1.0
-EDGE_MARGIN = 0.1  # of each side, excluded from medians and worst cases
+EDGE_MARGIN = 0.1  # margin of each side, excluded from medians and worst cases
 _WIRE_COUNT_BITS = 16  # counts are published as int16
 
 

@@ -140,7 +140,7 @@ class JointStateBuffer:
         self._sources: dict[tuple[str, ...], _JointSource] = {}
         self._held_back_until_ns: dict[tuple[str, ...], int] = {}
         self._problems: list[JointProblem] = []
-        # of each joint, whatever the source: the newest position, and its last jump
+        # newest position of each joint, whatever the source, and its last jump
         self._newest, self._newest_ns = np.full(m, np.nan), np.zeros(m, np.int64)
         self._jumped_ns = np.full(m, -_DISAGREEMENT_NS, np.int64)
         self._disagreed_until_ns = np.full(m, np.iinfo(np.int64).min, np.int64)

@@ -39,7 +39,7 @@ class BoundedHttpServer(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int], handler: Any, listener: socket.socket | None = None) -> None:
         self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        self._deadlines_s: dict[socket.socket, float] = {}  # of incomplete requests, oldest first
+        self._deadlines_s: dict[socket.socket, float] = {}  # deadlines of incomplete requests, oldest first
         self._lock = threading.Lock()
         if ":" in address[0]:
             self.address_family = socket.AF_INET6

@@ -19,7 +19,7 @@ from handtouch.node.iio import IIO_FOLDER, AdcReading, FloatArray, IioDevice, fi
 from handtouch.node.scan import ScanLayout
 
 DEVICES_FOLDER = Path("/dev")
-_MAX_AGE_NS, _MAX_AGE_PERIODS = 5_000_000, 3  # of a scan used for a sample, the longer of both
+_MAX_AGE_NS, _MAX_AGE_PERIODS = 5_000_000, 3  # age of a scan used for a sample, the longer of both
 _MAX_SILENCE_NS = 50_000_000  # without a scan, before that is a failure
 _CLOCK = "current_timestamp_clock"
 

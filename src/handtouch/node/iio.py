@@ -23,7 +23,7 @@ from handtouch.node.scan import ScanElement
 
 FloatArray = NDArray[np.float64]
 IIO_FOLDER = Path("/sys/bus/iio/devices")
-_MAX_ATTRIBUTE_BYTES = 4096  # of sysfs
+_MAX_ATTRIBUTE_BYTES = 4096  # size of a page in memory, which limits a file of sysfs
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ _REPORT_PERIOD_NS = 60_000_000_000
 _MAX_WAIT_S = 0.02
 _MAX_FRAMES = 1000  # handled at a time
 _RETRY_S = 0.1  # between attempts on a failing bus
-_MAX_STAMP_AGE_NS = 1_000_000_000  # of a SYNC; an older stamp is of another clock
+_MAX_STAMP_AGE_NS = 1_000_000_000  # age of a SYNC's stamp; an older one is of another clock
 
 _log = logging.getLogger("handtouch.node")
 

@@ -274,5 +274,5 @@ def _problems_in(settings: TouchNode) -> Iterator[Problem]:
 def _state_path(path: Path, settings: TouchNode) -> Path:
     if settings.state is not None:
         return path.parent / settings.state
-    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # of the systemd service
+    folder = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # set by systemd for the service
     return Path(folder) / "state.json" if folder else path.with_name(f"{path.name}.state.json")

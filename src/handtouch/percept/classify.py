@@ -23,7 +23,7 @@ from handtouch.percept.primitives import (
 
 FloatArray = NDArray[np.float64]
 
-_MAX_MISFIT_SIGMA = 4.0  # of chi^2, beyond which a class is rejected
+_MAX_MISFIT_SIGMA = 4.0  # misfit beyond which a class is rejected
 _MIN_CONTACTS, _MIN_CONTACTS_MOVING_OBJECT = 3, 6
 
 

@@ -17,10 +17,10 @@ from scipy.special import log_ndtr
 PRIOR_LIMIT, PRIOR_LOG_STD = 0.95, 0.35
 """Limit of friction before anything is known, with the standard deviation of its logarithm: objects differ by
 that, and so do pads."""
-_SLIP_LOG_STD = 0.4  # of one observed slip: pads and spots differ, and slips are observed late
+_SLIP_LOG_STD = 0.4  # spread of one observed slip: pads and spots differ, and slips are observed late
 _MIN_LOG_STD = 0.1
 _MIN_SLIP_PROBABILITY = 0.003
-"""Of a limit below an observed slip's ratio; a rarer slip was none: the pad rolled."""
+"""Probability of a limit below an observed slip's ratio; a rarer slip was none: the pad rolled."""
 _SLIP_SPAN_S = 0.1  # before a slip is observed, in which the greatest ratio was the limit
 _STICK_LOG_STD = 0.1  # noise of the ratio of a contact that sticks
 _RATE_TIME_S = 0.02  # smoothing of the ratio's rate

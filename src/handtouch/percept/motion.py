@@ -26,10 +26,10 @@ from handtouch.percept.slip_evidence import SlipEvidence
 FloatArray = NDArray[np.float64]
 
 _ROLLING_PRIOR = 0.2  # fraction of moving centroids that roll, without joint states
-_MIN_SAMPLES = 4  # of a contact, before which its motion is undetermined
+_MIN_SAMPLES = 4  # samples of a contact before which its motion is undetermined
 _REPORT_PERIOD_NS = 50_000_000
 _LIFT_OFF_HORIZON_S, _FORCE_RATE_TIME_S = 0.04, 0.02  # as in the slip stage
-_MIN_SLIDING_PROBABILITY = 0.8  # of slip by joint states, while the centroid isn't known to move
+_MIN_SLIDING_PROBABILITY = 0.8  # probability of slip by joint states, while the centroid isn't known to move
 
 
 class MotionReporter:

@@ -28,8 +28,8 @@ SHAPE_CLASSES = ("flat", "edge", "cylinder", "sphere")
 SIZE_PARAMETERS = {"flat": (), "edge": (), "cylinder": ("radius",), "sphere": ("radius",)}
 
 _MAX_ITERATIONS = 12
-_COST_TOLERANCE = 1e-3  # of twice the logarithm of the posterior
-_DIFFERENCE_STEP = 1e-6  # of numerical derivatives, in metres, radians, and logarithms
+_COST_TOLERANCE = 1e-3  # change of twice the logarithm of the posterior
+_DIFFERENCE_STEP = 1e-6  # step of numerical derivatives, in metres, radians, and logarithms
 _MIN_START_RADIUS_M, _MAX_START_RADIUS_M = 1e-3, 0.3
 
 

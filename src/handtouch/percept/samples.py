@@ -27,7 +27,7 @@ SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
     "pad_noise_m2": (2, 2),  # part of pad_m's covariance that is independent in each sample
     "position_m": (3,),  # in the link's frame
     "normal": (3,),
-    "covariance_m2": (3, 3),  # of position_m, systematic errors included
+    "covariance_m2": (3, 3),  # covariance of position_m, systematic errors included
     "force_n": (),  # sheet behaviour compensated, where it is modelled
     "force_std_n": (),
     "total_current_a": (),
@@ -36,7 +36,7 @@ SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
     "palm_position_m": (3,),  # NaN without joint states; also the following
     "palm_normal": (3,),
     "palm_covariance_m2": (3, 3),
-    "palm_rotation": (3, 3),  # of the link frame in the palm frame
+    "palm_rotation": (3, 3),  # rotation of the link frame in the palm frame
     "palm_joints_m2": (),  # contribution of joints to palm_covariance_m2, mean per axis
     "joints_age_s": (),
     "slip_log_odds": (),  # ln of the odds of slip; infinite while it slips

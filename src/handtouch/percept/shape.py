@@ -36,7 +36,7 @@ SPOT_CLASSES = ("point", "along x", "along y")
 
 _MAX_POINTS = 100  # kept of a hand
 _MIN_POINT_DISTANCE_M, _MIN_NORMAL_CHANGE = 2e-3, 0.1  # from one stored point to the next; radians
-_MIN_SAMPLES = 8  # of a new contact before its points are stored
+_MIN_SAMPLES = 8  # samples of a new contact before its points are stored
 _FORGET_TIME_NS = 5_000_000_000  # without touch, before the next object is assumed
 _OBJECT_DRIFT_M_PER_S, _MAX_OBJECT_DRIFT_M = (
     1.5e-3,
@@ -46,7 +46,7 @@ _STEPS_PER_FIT = 2
 _SPOT_PERIOD_NS = 500_000_000
 _SPOT_SAMPLES = 64
 _ELONGATED_RESIDUAL_STD = 0.05  # prior of contacts that aren't points
-_POINT_RESIDUAL_STD = 3e-3  # of a point on a pad within its tolerances
+_POINT_RESIDUAL_STD = 3e-3  # error of a point on a pad within its tolerances
 _REQUESTED_SLIDE_M = 5e-3
 _SLIDE_COST = 2.0  # sliding disturbs a grasp more than squeezing does
 

@@ -43,7 +43,7 @@ class PerceptWorker:
         shear_pads = np.array([pad.shear is not None for pad in pads], np.bool_)
         self._pipeline = PerceptPipeline.build(self.contacts, self.pair_distance_m, shear_pads)
         self._requested = np.zeros(n, dtype=np.uint8)
-        self._xy = np.full((n, 2), np.nan)  # of the last samples
+        self._xy = np.full((n, 2), np.nan)  # positions of the last samples
         self._status_ns = 0
         self._last_reported: dict[tuple[str, int, int], tuple[int, str, str]] = {}
         """kind, hand, pad -> time [ns], state, label"""

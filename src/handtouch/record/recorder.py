@@ -95,7 +95,7 @@ class MessageRecorder:
         self._seq: dict[str, int] = {}
         self._state_requested_ns = self._state_ns = self._flushed_ns = self._file_opened_ns = 0
         self._needs_state = True
-        self._state_tick: int | None = None  # of a state without a tick since
+        self._state_tick: int | None = None  # tick of a state since which no tick was recorded
 
     @property
     def size(self) -> int:
@@ -199,7 +199,7 @@ class MessageRecorder:
         if ENCODING[prefix] == "json":
             try:
                 data = json.dumps(payload, separators=(",", ":"), allow_nan=False).encode()
-            except (TypeError, ValueError):  # of a later version of the daemon
+            except (TypeError, ValueError):  # a state of a later version of the daemon
                 self.malformed += 1
                 return
         if prefix in _REPEATED_PREFIXES:

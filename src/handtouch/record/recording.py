@@ -32,7 +32,7 @@ MAX_CHUNK_BYTES = 16 << 20
 MAX_MESSAGE_BYTES = 8 << 20
 """Largest message: `config` with its EDS and URDF files is the largest of the daemon's"""
 _MAX_ITEMS = 1 << 17
-"""Of one list or map: a column of a hand has far fewer"""
+"""Items of one list or map: a column of a hand has far fewer"""
 _MESSAGE_HEAD_BYTES = 22
 _DAMAGE = (
     *(McapError, zstandard.ZstdError, struct.error, ValueError, TypeError, OverflowError),

@@ -31,7 +31,7 @@ IntArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
 
 _SPEEDS = ((0.0, 1.0), (1.0, 0.2), (1.0, 0.4), (1.0, 0.63), (1.0, 1.0), (1.0, 1.6), (1.0, 3.0))
-"""Of adaptation: share and time constant, over those of the preset."""
+"""Share and time constant of adaptation over those of the preset."""
 _CREEP_ENDS_S = (40.0, np.inf)
 _MODELS = [(share, time, end) for end in _CREEP_ENDS_S for share, time in _SPEEDS]
 _SHARE, _TIME, _CREEP_END_S = np.array(_MODELS).T
@@ -43,12 +43,13 @@ _REFERENCE_S = np.where(np.isfinite(_CREEP_END_S), 10.0, _FIRST_S)
 """Age at which a reading is the load's."""
 _STEADY_PROBABILITY = 0.5
 _STEADY_STD, _UNSTEADY_STD = 0.01, 0.15
-"""Of changes of the log reading between windows of a steady hold, and of one that isn't."""
+"""Changes of the log reading between windows of a steady hold, and of one that isn't."""
 _SATURATED_PROBABILITY, _SATURATED_SHARE = 0.5, 0.1
-"""Of a press that finds its sheet adapted to it already, if the share of adaptation is small; and the part of
-a load that isn't adapted to at which that is half as probable. With a share of 1 there is no such press."""
+"""Probability of a press that finds its sheet adapted to it, if the share of adaptation is small; and the
+part of a load that isn't adapted to at which that is half as probable. With a share of 1 there is no such
+press."""
 _CORRELATION_S = 1.0
-"""Of the scatter inside a window."""
+"""Correlation time of the scatter inside a window."""
 _EXCEPTION = 0.02
 """Probability that one pad's sheet adapts and others of its material don't, or the reverse."""
 _REJECTED = 0.9

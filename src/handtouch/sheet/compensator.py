@@ -121,7 +121,7 @@ class SheetCompensator:
         )
         """Variances proportional to the square of the effective load, to the effective load, and constant."""
         self.last_step = np.zeros((4, pads))
-        """Of the last step: load, load before hysteresis, effective load, and reading [N]."""
+        """Load, load before hysteresis, effective load, and reading [N] of the last step."""
         self._set_interval(0.0)
 
     @property

@@ -58,7 +58,7 @@ class BenchCircuit:
     alpha: float
     equal_resistance_n: float
     drive_v: float = 12.0
-    radius_m: float = 5.06e-3  # of a disc as large as the spacer: 1 cm^2 less four holes of 2.5 mm
+    radius_m: float = 5.06e-3  # radius of a disc as large as the spacer: 1 cm^2 less four holes of 2.5 mm
     spreading_radius_m: float = 0.0222  # conformal radius of the middle of the sheet
 
     @property

@@ -112,7 +112,7 @@ class CoarseSolution:
     shares: FloatArray
     """(4, n, n), at the nodes of the tables of `SheetMaps`."""
     factors: SuperLU
-    """Of the stiffness matrix of the nodes without electrode."""
+    """Factors of the stiffness matrix of the nodes without electrode."""
 
 
 def _stiffness_matrix(of_s: FloatArray, of_phi: FloatArray, weight: FloatArray) -> sparse.csr_array:

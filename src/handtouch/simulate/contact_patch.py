@@ -82,7 +82,7 @@ def effective_patch(
     cos, sin = focus_m / np.where(length > 0, length, 1.0)
     xx = stretch**2 * (longer * cos**2 + shorter * sin**2)
     yy, xy = longer * sin**2 + shorter * cos**2, stretch * (longer - shorter) * cos * sin
-    difference = np.hypot(xx - yy, 2 * xy)  # of the squares of the new half axes
+    difference = np.hypot(xx - yy, 2 * xy)  # difference of the squares of the new half axes
     turned = np.arctan2(2 * xy, xx - yy) / 2
     focus = np.sqrt(difference) * np.stack([np.cos(turned) / stretch, np.sin(turned)])
     mean = (np.sqrt((xx + yy + difference) / 2) + np.sqrt((xx + yy - difference) / 2)) / 2

@@ -39,7 +39,7 @@ _MAX_SAMPLE_GAP_S = 0.05
 """If samples are further apart, on an overloaded machine, simulated time pauses."""
 _JOINT_LAG_S = 0.01
 _TIME_STEP_S = 0.001
-_HOME_OFFSET_M = 0.03  # of each fingertip from the centre, with its joint at 0
+_HOME_OFFSET_M = 0.03  # distance of each fingertip from the centre, with its joint at 0
 _PAD_FRACTION_RANGE = (0.02, 0.98)
 
 

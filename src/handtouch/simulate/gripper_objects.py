@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-_SEARCH_POINTS = 40  # of the curve, on either side of the last contact
+_SEARCH_POINTS = 40  # points of the curve on either side of the last contact
 
 
 class FingertipPositions(NamedTuple):

@@ -31,9 +31,10 @@ from handtouch.simulate.unevenness import Unevenness
 
 FloatArray = NDArray[np.float64]
 _DEGREE, _RADIUS_DEGREE, _ARC_RADIUS_DEGREE = 5, 4, 3  # arcs have more elements
-_MIN_GAP_FRACTION = 1e-3  # of a side
-_MIN_ARC_FRACTION = 1e-4  # of a side: shorter parts of an electrode are left out
-_MIN_STATIC_TIMES = 20  # of each two contacts that don't move, from which on they are solved without a table
+_MIN_GAP_FRACTION = 1e-3  # bare gap over a side
+_MIN_ARC_FRACTION = 1e-4  # part of an electrode over a side; shorter ones are left out
+_MIN_STATIC_TIMES = 20
+"""Samples of two contacts that don't move, from which on they are solved without a table."""
 _TABLE_DEGREE = 12
 _NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
 _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
@@ -214,7 +215,7 @@ class _OutlineSheet:
             drawn, slopes = _stretched(self._shape, on_side)
             along = slopes[:, 1 if side < 2 else 0]
             x, y = drawn[:, :, None] - source[:, None]
-            sign = 1.0 if side in (1, 2) else -1.0  # of the direction of the outline along the side
+            sign = 1.0 if side in (1, 2) else -1.0  # sense of the outline along the side
             turn = sign * (x * along[1][:, None] - y * along[0][:, None]) / (x * x + y * y)
             weights = line.weights[is_bare, None] * turn / (2 * math.pi)
             numbers = self._side_numbers[side]
@@ -290,7 +291,7 @@ def _distinct(ends: list[float]) -> list[float]:
 
 
 _Covered = list[list[tuple[int, float, float]]]
-"""Of each electrode, what it covers: side (0 to 3: x0, xa, y0, yb), begin and end as fractions of it."""
+"""Parts that each electrode covers: side (0 to 3: x0, xa, y0, yb), begin and end as fractions of it."""
 
 
 def _sides_covered(shape: SimulatedOutline, gaps: ElectrodeGaps) -> _Covered:

@@ -42,7 +42,8 @@ from handtouch.simulate.unevenness import Unevenness
 FloatArray = NDArray[np.float64]
 _MIN_FORCE_N = 1e-6  # avoids a division by 0
 _MAX_BATCHED_TIMES = 20
-_UNIFORM_DISC_RESISTANCE = 0.25  # of a disc with uniform current density, besides ln(R / a), in rho / 2 pi
+_UNIFORM_DISC_RESISTANCE = 0.25
+"""Resistance of a disc with uniform current density, besides ln(R / a), in rho / 2 pi."""
 
 
 def contact_layer_ohm(
@@ -139,7 +140,7 @@ class PadCircuit:
                 one.currents(times_s, touches, faults, force_ratio, supply_ratio)
                 for one in self._state_circuits
             ]
-            return np.asarray(sum(by_state))  # of each electrode all but one are 0
+            return np.asarray(sum(by_state))  # each electrode is 0 in all states but one
         changes = [fault for fault in faults if _changes_circuit(fault)]
         currents = np.zeros((len(times_s), len(self.series_ohm)))
         active = np.array([fault.is_active(times_s) for fault in changes]).reshape(len(changes), len(times_s))

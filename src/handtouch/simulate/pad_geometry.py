@@ -20,7 +20,7 @@ from scipy.interpolate import BPoly, CubicSpline, PPoly
 
 FloatArray = NDArray[np.float64]
 _ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(20)
-_PROFILE_CELLS, _NEWTON_STEPS = 400, 3  # of a projection to a spline profile
+_PROFILE_CELLS, _NEWTON_STEPS = 400, 3  # cells and steps of a projection to a spline profile
 _HULL_CIRCLE_POINTS, _HULL_PROFILE_CIRCLES = 96, 24
 _PLATE_THICKNESS_M = 4e-3
 

@@ -20,8 +20,8 @@ from handtouch.simulate.truth import GroundTruth, Vector
 FloatArray = NDArray[np.float64]
 _MAX_DELAY_PERIODS = 5
 """A contact that begins at most this long after its touch has ended is late, not a false positive."""
-_95_PERCENT_CHI2 = 0.0, 3.841, 5.991, 7.815  # of so many degrees of freedom; two along a pad
-_MIN_RELATIVE_VARIANCE = 1e-6  # of an axis, to count as one
+_95_PERCENT_CHI2 = 0.0, 3.841, 5.991, 7.815  # quantiles by degrees of freedom; two along a pad
+_MIN_RELATIVE_VARIANCE = 1e-6  # variance of an axis, over the greatest, to count as one
 _95_PERCENT_SIGMA = 1.96
 
 
@@ -60,7 +60,7 @@ class LinkScore:
     samples: int
     """Fresh samples of contacts that have a position."""
     rms_error_m: float
-    """Of positions on the link: error on the pad and error of the pad's mount."""
+    """Rms error of positions on the link: error on the pad and error of the pad's mount."""
     pad_error_m: float
     """Rms error of positions relative to the pad, as it is stated to be mounted."""
     mount_error_m: float

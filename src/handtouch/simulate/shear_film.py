@@ -25,8 +25,8 @@ IntArray = NDArray[np.intp]
 _FINE = (1e-5, 1.2)  # element at an edge, in thicknesses of the film, and growth from one to the next
 _COARSE = (1e-2, 2.0)
 _COARSEST = 2.0
-_MARGIN = 4.0  # of the film beyond the outermost edge
-_TINY = 1e-6  # of the thickness: contact resistance that stands for none, as a length of film
+_MARGIN = 4.0  # margin of the film beyond the outermost edge
+_TINY = 1e-6  # length of film that stands for no contact resistance, over the thickness
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ FloatArray = NDArray[np.float64]
 
 _MM = 1e-3
 _TABLE_NODES = 7
-_OUTER = 2.3  # of the overlap: width of an electrode
+_OUTER = 2.3  # width of an electrode over the overlap
 _WIDE = 8.0  # thicknesses of the film: an overlap whose edges don't see each other
 _SHEAR_MODULUS_PA = 2e5
-_SHEAR = 0.1  # of the layer, at which its stiffening is stated
+_SHEAR = 0.1  # shear of the layer at which its stiffening is stated
 _PLAY_SHARES = 3.0 ** -np.arange(1, 6)  # radii of plays over the force at this shear
 _CREEP_S = 5.0
 _POINTS = (np.arange(7) + 0.5) / 7 - 0.5  # along an edge
@@ -156,7 +156,7 @@ class SimulatedShearPad:
         )
         film_conductance = 1 / (film * (1 + 2 * self.hidden.contact_share))
         found = []
-        angles = (np.arange(_ARC) + 0.5) / _ARC * math.pi / 2 - math.pi / 4  # of a sector that faces +x
+        angles = (np.arange(_ARC) + 0.5) / _ARC * math.pi / 2 - math.pi / 4  # a sector that faces +x
         for channel, middle in enumerate((math.pi, 0.0, -math.pi / 2, math.pi / 2)):
             inset = (pattern.gap_mm / 2 - self.hidden.edge_offset_mm[channel]) * _MM - self._gap_gain_m
             corner = math.sqrt(2) * inset * np.array([math.cos(middle), math.sin(middle)])

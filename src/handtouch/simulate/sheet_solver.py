@@ -35,10 +35,10 @@ FloatArray = NDArray[np.float64]
 EDGE_INSET_FRACTION: Final = 0.02
 """Smallest distance from a side at which maps are evaluated, as a fraction of the pad."""
 
-_MIN_GAP_FRACTION = 1e-3  # of the side: adjoining electrodes would short the corner
+_MIN_GAP_FRACTION = 1e-3  # bare gap over the side: adjoining electrodes would short the corner
 _MIN_GAP_DIFFERENCE_FRACTION = 1e-5  # smaller differences of opposite gaps are removed, to avoid slivers
 _EDGE_BREAKS = np.array([EDGE_INSET_FRACTION, 0.03, 0.045, 0.065, 0.1, 0.16, 0.25, 0.37])
-_SHARE_BREAKS = np.concatenate([_EDGE_BREAKS, [0.5], 1 - _EDGE_BREAKS[::-1]])  # of the tables' elements
+_SHARE_BREAKS = np.concatenate([_EDGE_BREAKS, [0.5], 1 - _EDGE_BREAKS[::-1]])  # elements of the tables
 _RADIUS_BREAKS = np.array([EDGE_INSET_FRACTION, 0.08, 0.35, 0.65, 0.92, 1 - EDGE_INSET_FRACTION])
 _TABLE_DEGREE = 5
 _POWERS = np.arange(_TABLE_DEGREE + 1)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-_GRADING_RATIO = 0.25  # of successive elements towards a square-root singularity of the potential
-_MIN_ELEMENT_FRACTION = 1e-3  # of the axis
-_MAX_ELEMENT_FRACTION = 0.15  # of the axis
+_GRADING_RATIO = 0.25  # ratio of successive elements towards a square-root singularity of the potential
+_MIN_ELEMENT_FRACTION = 1e-3  # shortest element over the axis
+_MAX_ELEMENT_FRACTION = 0.15  # longest element over the axis
 
 
 @dataclass(frozen=True)

@@ -47,9 +47,8 @@ _INTERFACES_REPORTING_STATE = frozenset({"ixxat", "etas"})
 """Interfaces whose python-can `state` is the controller's; elsewhere it is the last value set."""
 _SEND_TIMEOUT_S = 0.01  # an adapter that hangs must not delay the other buses longer than this
 _MIN_RETRY_S, _MAX_RETRY_S = 0.1, 2.0
-_MAX_CONSECUTIVE_ERRORS = (
-    20  # reopening loses the waiting frames; a few bad datagrams or lines don't justify it
-)
+_MAX_CONSECUTIVE_ERRORS = 20
+"""Reopening loses the waiting frames; a few bad datagrams or lines don't justify it."""
 _SO_RCVBUFFORCE = 33
 _DISCONNECTED_ERRNOS = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is unusable
 _MAX_CLOCK_READ_NS = 5_000

@@ -36,7 +36,7 @@ class BusCounters:
 
     frames: int = 0  # received data frames with an 11-bit identifier
     sent: int = 0
-    bits: int = 0  # of received and sent frames with worst-case bit stuffing; their rate is the bus load
+    bits: int = 0  # bits received and sent, with worst-case bit stuffing; their rate is the bus load
     samples: int = 0  # PDOs that carry channels
     wrong_length: int = 0  # known identifier, wrong length: dropped
     unknown_frames: int = 0  # unknown identifier, or a kind of frame that CANopen doesn't use: dropped

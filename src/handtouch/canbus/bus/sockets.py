@@ -39,7 +39,7 @@ from handtouch.canbus.bus.router import IDENTIFIER_COUNT, CanFrame, Router
 from handtouch.core.stages.receive import frame_arrival_ns
 
 _SO_MEMINFO = 55
-_MEMINFO_DROPS_INDEX = 8  # of 32-bit words
+_MEMINFO_DROPS_INDEX = 8  # index among 32-bit words
 _DROPPED_PERIOD_NS = 50_000_000
 _DROPPED_FRAMES = 32
 """Dropped frames are counted that often, and whenever so many were waiting: only a full queue drops any."""

@@ -29,7 +29,7 @@ _MIN_SETTLE_S, _MAX_WAIT_S = 0.001, 0.5
 _MAX_ATTEMPTS = 4
 _MAX_PASSES = 5
 _MAX_MISMATCHES = 6  # in a row, without finding a node
-_MAX_VALUES = 127  # of one part of the addresses; no bus has more nodes
+_MAX_VALUES = 127  # values of one part of the addresses; no bus has more nodes
 _MAX_RESPONSES = 256  # responses of a babbling node must not delay the scan
 _SERIAL_PART = 3
 _CONTRADICTION = (0xB6D24F19, 0x492DB0E6)
@@ -75,7 +75,7 @@ class LssMaster:
         self._exchange = exchange
         self._clock = clock
         self._response_timer = _ResponseTimer(min_wait_s)
-        self._mismatches, self._is_incomplete = 0, False  # of the present search
+        self._mismatches, self._is_incomplete = 0, False  # results of the present search
 
     @property
     def wait_s(self) -> float:
@@ -266,7 +266,7 @@ class LssMaster:
             ):
                 continue
             first_ns = last_ns = self._clock()
-            for _ in range(_MAX_RESPONSES):  # of the slower ones
+            for _ in range(_MAX_RESPONSES):  # responses of the slower ones
                 if self._exchange(None, self._response_timer.wait_s) is None:
                     break
                 last_ns = self._clock()

@@ -98,7 +98,7 @@ class BusSurvey:
         self._identity_values: dict[int, dict[tuple[int, int], set[bytes]]] = {}
         self._responding_ids: set[int] = set()
         self._probed_ids: set[int] = set()
-        self._invalid_responses: dict[int, bytes] = {}  # of probed nodes
+        self._invalid_responses: dict[int, bytes] = {}  # invalid responses of probed nodes
         self._readers: dict[int, SdoTransport] = {}
         self._lss_responses: deque[bytes] = deque()
 

@@ -195,7 +195,7 @@ def _on_boot_up(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
         last_frame_ns=now_ns,
         last_heartbeat_ns=None,  # after a restart the heartbeat time is the node's default, perhaps 0
         heartbeat_required=False,
-        failures=0,  # of boots before the restart
+        failures=0,  # failed boots before the restart
         reboots=life.reboots + known,
         boot_ups=life.boot_ups + by_itself,
         identified=False,

@@ -122,9 +122,9 @@ class Lifecycle(NamedTuple):
     silence: str = ""  # STALE, ABSENT: what is missing
     bus_cause: str = ""  # STALE, ABSENT: its cause in the host or the bus, empty if it is the node's
     alone_ns: int | None = None  # ABSENT: since when others of its bus are heard again, after a common cause
-    checks: int = 0  # of its settings, in close succession
+    checks: int = 0  # checks of its settings, in close succession
     check_ns: int = -(1 << 62)  # time of the next one
-    repairs: int = 0  # of changed settings, in close succession
+    repairs: int = 0  # repairs of changed settings, in close succession
     repaired_ns: int = 0  # time of the last one
     boot_reason: str = ""  # cause of the present boot
     standby: bool = False  # not needed now: configured, but stopped instead of started

@@ -37,9 +37,8 @@ PARAMETERS = ("contact_ohm_mm2", "alpha", "ohm_per_square")
 
 SHEET_LOG_STD = 0.2
 """Standard deviation of ln of the file's sheet resistance, used if the readings don't determine it."""
-_MAX_OBSERVED_LOG_STD = (
-    0.1  # standard deviation of ln sheet resistance, from the readings alone, that counts as observed
-)
+_MAX_OBSERVED_LOG_STD = 0.1
+"""Standard deviation of ln sheet resistance, from the readings alone, that counts as observed."""
 MIN_EVIDENCE = 6.0
 """Twice the log likelihood ratio from which on the other radius law replaces the deployment's: "strong" in
 the scale of Kass and Raftery, J. Am. Stat. Assoc. 90, 1995; a ratio of 20."""
@@ -48,7 +47,7 @@ _MAX_HALF_INTERVALS = {
     "contact_ohm_mm2": math.log(2),
     "alpha": 0.4,
 }  # half widths above which an interval is useless
-_MIN_CURRENT_SLOPE = 0.2  # of ln current by ln force; 1 to 2 if the contact limits the current
+_MIN_CURRENT_SLOPE = 0.2  # d ln current / d ln force; 1 to 2 if the contact limits the current
 _MIN_LAW_PROBABILITY = 1e-3  # probability below which the readings contradict any such law
 _NO_FIT_DEVIANCE = 1e6
 _MAX_ITERATIONS, _MAX_STEP, _CONVERGED_STEP = 60, 1.0, 1e-9
@@ -318,7 +317,7 @@ def _build_fit(
     residual = data.log_current - data.log_current_model(theta)
     misfit = math.sqrt(float((residual**2 / solved.variance).mean()))
     by_load, _ = data.slopes(theta)
-    share = by_load / law.alpha  # of the contact in the total resistance
+    share = by_load / law.alpha  # share of the contact in the total resistance
     problems = _problems(solved, half, share, readings, residual)
     remarks = _remarks(observed, share, half[2], quantile * solved.sheet_std, solved.scatter)
     radii = np.exp(theta[3:])

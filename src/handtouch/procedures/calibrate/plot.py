@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 _WIDTH, _HEIGHT = 60, 15
-_FORCE_MARGIN = 1.3  # of the lightest and heaviest weight
+_FORCE_MARGIN = 1.3  # range of the plot beyond the lightest and heaviest weight
 _INK, _FIT, _BAND, _FAINT = "#1a1a1a", "#1f6fb4", "#1f6fb4", "#8a8a8a"
 _MARKS = ("o", "s", "^", "D")
 _DPI = 150

@@ -18,10 +18,9 @@ from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import pad_network, pad_surface
 from handtouch.host.units import GRAM_FORCE_N
 
-_MAX_CENTRE_OFFSET_FRACTION = (
-    0.3  # of a side, from the middle: farther out, the sheet's resistance changes quickly
-)
-_MAX_RANGE_FRACTION = 0.98  # of a channel's range
+_MAX_CENTRE_OFFSET_FRACTION = 0.3
+"""Distance from the middle over a side: farther out, the sheet's resistance changes quickly."""
+_MAX_RANGE_FRACTION = 0.98  # fraction of a channel's range
 
 
 @dataclass(frozen=True)

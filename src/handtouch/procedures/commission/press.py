@@ -17,8 +17,8 @@ BoolArray = NDArray[np.bool_]
 
 PRESS_THRESHOLD_SIGMA = 100.0  # about 0.3 % of the usual range
 RELEASE_THRESHOLD_SIGMA = 40.0
-MIN_REACTION_SIGMA = 8.0  # of a channel: less is no response to a press
-MIN_SECOND_PAD_FRACTION = 0.2  # of the strongest pad's current: a pad above this is pressed too
+MIN_REACTION_SIGMA = 8.0  # change of a channel: less is no response to a press
+MIN_SECOND_PAD_FRACTION = 0.2  # current over the strongest pad's: a pad above this is pressed too
 _MIN_PRESS_NS = 300_000_000  # least duration of a press; its first third isn't used
 _MIN_QUIET_NS = 150_000_000
 _BASELINE_UPDATE_FRACTION = 0.05  # correction of the baseline by each quiet sample

@@ -13,9 +13,9 @@ from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import mount_transform, pad_surface
 from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, target_fractions
 
-_MIN_NAMED_COMPONENT_FRACTION = 0.6  # of the greatest component, to be named too
+_MIN_NAMED_COMPONENT_FRACTION = 0.6  # component over the greatest one, to be named too
 _OPPOSITE_ELECTRODE: dict[str, str] = {"x0": "xa", "xa": "x0", "y0": "yb", "yb": "y0"}
-_MAX_SIMILAR_DISTANCE_RATIO = 0.97  # of distances of two ends from the link's origin
+_MAX_SIMILAR_DISTANCE_RATIO = 0.97  # ratio of the distances of two ends from the link's origin
 
 
 def describe_position(pad: config.Pad, electrode: str) -> str:

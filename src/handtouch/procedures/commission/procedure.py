@@ -47,7 +47,7 @@ _MIN_REST_NS, _MIN_REST_SAMPLES = _NS_PER_S, 24
 _MAX_ATTEMPTS = 3
 _REQUIRED_PRESSES, _EXTRA_PRESSES = ("xa", "yb"), ("x0", "y0", "xa", "yb")
 """Electrodes on sides that are pressed, and those that are pressed while the order is ambiguous."""
-_SATURATION_FRACTION = 0.98  # of the range
+_SATURATION_FRACTION = 0.98  # fraction of the range
 _NO_ANSWER_TEXT = (
     "no node responded. Likely causes: the node isn't on the bus, or has a node id that the deployment "
     "doesn't list (see `handtouch scan`); the pad isn't connected to its node; the sheet has no supply; or "
@@ -386,7 +386,7 @@ class CommissioningProcedure:
     def _press_readings(
         self, slot: int, presses: Sequence[tuple[str, Press]], working: NDArray[np.bool_]
     ) -> list[PressReading]:
-        per_count = self._full_scale_per_count[slot]  # of full scale
+        per_count = self._full_scale_per_count[slot]  # full scale per count
         noise = float(self._detector.noise_counts[slot] * per_count.max())
         return [
             PressReading(electrode, np.abs(press.counts) * per_count, noise, working)

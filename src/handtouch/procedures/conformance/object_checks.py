@@ -185,7 +185,7 @@ def summarise_transfers(session: NodeSession) -> None:
     if report.identity is not None and (last := read_identity(session.sdo)) != report.identity:
         report.failed("identity.read", f"{report.identity} at first, {last} at the end: node replaced?")
     try:
-        name = link.client.upload(cia301.DEVICE_NAME, 0)  # of more than four bytes: a segmented upload
+        name = link.client.upload(cia301.DEVICE_NAME, 0)  # a name of more than four bytes: a segmented upload
         segmented = "" if len(name) <= 4 else ", segmented upload of 0x1008"
     except SdoAbortedError:
         segmented = ""

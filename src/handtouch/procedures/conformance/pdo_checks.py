@@ -23,7 +23,7 @@ _EVENT_TIMER_MS = 50
 _MAX_LATE_SHARE = 0.01
 _MAX_ATTEMPTS = 3
 _MAX_SYNC_ERROR = 0.2
-"""Of a period; above it this computer, not the node, may be the cause of late TPDOs."""
+"""Error of SYNC over a period; above it this computer, not the node, may be the cause of late TPDOs."""
 _MAX_NOISE_RATIO = 2.0
 _NOISE_COUNTS_LIMIT = 0.01
 """Fraction of the range above which noise is a fault where the deployment states none."""

@@ -26,7 +26,8 @@ _SKIN_MODULUS_PA = 1.0e6  # effective modulus of a rubber skin on a hard object
 _MIN_RADIUS_M, _MAX_RADIUS_M = 0.5e-3, 5e-3
 _MIN_FORCE_N = 1e-4
 _MAX_OVERHANG_M = 0.5e-3  # points that far beyond the edge of a pad press on the edge
-_MAX_HEIGHT_M = 5e-3  # of a contact point above or below the surface: penetration, and pads out of place
+_MAX_HEIGHT_M = 5e-3
+"""Height of a contact point above or below the surface: penetration, and pads out of place."""
 _UNIFORM_LOAD_RATIO = 3**-0.5  # a uniform line or rectangle has a third of the second moment of its ends
 
 
@@ -171,9 +172,9 @@ def clip_to_pad(
     inward = np.where(position < 0.5, 1.0, -1.0)
     depth = np.clip(
         (0.5 - np.abs(position - 0.5)) * sides / radius[:, None], 0.0, 1.0
-    )  # of the centre, in radii
-    part = 1 - (np.arccos(depth) - depth * np.sqrt(1 - depth**2)) / np.pi  # of a disc cut by a chord
-    shift = 2 / (3 * np.pi) * (1 - depth**2) ** 1.5 / part  # of its centroid, in radii
+    )  # depth of the centre, in radii
+    part = 1 - (np.arccos(depth) - depth * np.sqrt(1 - depth**2)) / np.pi  # area of a disc cut by a chord
+    shift = 2 / (3 * np.pi) * (1 - depth**2) ** 1.5 / part  # shift of its centroid, in radii
     radii = np.maximum(radius * np.sqrt(part.prod(axis=1)), _MIN_RADIUS_M)
     return steps, position + inward * shift * radius[:, None] / sides, force, radii
 

@@ -33,7 +33,7 @@ from handtouch.simulate.worlds.spreads import (
 FloatArray = NDArray[np.float64]
 PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
-_MAX_ARC_GROWTH = 0.4  # of the shortest bare stretch between electrodes on arcs, at each end
+_MAX_ARC_GROWTH = 0.4  # growth at each end over the shortest bare stretch between electrodes on arcs
 UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
 

@@ -23,18 +23,19 @@ _MIN_REPEATS = 200
 _MIN_RAILED_NS = 1_000_000_000
 _MIN_RAILED_TOUCHED_NS = 20_000_000_000
 _TOUCHED_CONFIDENCE = 0.6
-"""Of saturation without a moment at which the other channels rest, by no contact beyond the range."""
-_MAX_UNTOUCHED_FRACTION = 0.03  # of the railed channel: less than the others get from a contact anywhere
-# of the currents that the layer's potential on an electrode drives into the others: their sum over that
-# of the nominal sheet, whose resistance isn't known better; and the deviation of each from the nominal share
+"""Confidence of saturation when the other channels never rested, beyond the range of any contact."""
+_MAX_UNTOUCHED_FRACTION = 0.03
+"""Part of the railed channel's current: less than the others get from a contact anywhere."""
+# currents that the layer's potential on an electrode drives into the others: their sum over that
+# of the nominal sheet (whose resistance isn't known better), and the deviation of each from the nominal share
 _IDLE_RATIO_RANGE = (0.3, 3.0)
 _MAX_IDLE_DEVIATION, _MAX_IDLE_DEVIATION_OF_SUM = 0.3, 0.03
 _PLACES = 24  # along each side, of contacts that may explain a channel at its top
 _MIN_FIRM_FRACTION, _MAX_FIRM_DEVIATION = 0.8, 0.15
-"""Of the top of the range that a contact reaches; of its other currents that it leaves unexplained: what
-sheets differ from the nominal one, and the lowest currents of a contact that moves."""
+"""Reading of a contact over the top of the range; part of its other currents left unexplained, by sheets that
+differ from the nominal one and the lowest currents of a contact that moves."""
 _MIN_SHORT_FRACTION = 0.75
-"""Of the current through an electrode's series resistor, at which it may be shorted to the layer."""
+"""Part of the current through an electrode's series resistor at which it may be shorted to the layer."""
 _MIN_CHANNELS_OF_SHORT = 2
 _MAX_SILENT_SIGMA = 10.0
 """Lowest short mean of a channel without a current, of the noise of a reading."""
@@ -77,10 +78,10 @@ class ChannelFaultDetector:
         self._recent_min_counts = self._min_counts.copy()  # the same within the present part of a window
         self._last_ns = np.zeros((n, 1), dtype=np.int64)
         self._idle_counts = [_idle_counts(model, row) for row in range(n)]  # (shorted, channels) of each pad
-        self._short_counts = np.full((n, c), np.inf)  # of a channel whose electrode is shorted
+        self._short_counts = np.full((n, c), np.inf)  # reading of a channel whose electrode is shorted
         for row, idle in enumerate(self._idle_counts):
             self._short_counts[row, : len(idle)] = np.diag(idle)
-        self._fractions: dict[int, FloatArray] = {}  # of a grid of contacts, by the network's id
+        self._fractions: dict[int, FloatArray] = {}  # fractions of a grid of contacts, by the network's id
         self.faults: dict[tuple[int, int], ChannelFault] = {}
 
     @property

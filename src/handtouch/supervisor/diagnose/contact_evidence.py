@@ -22,7 +22,8 @@ _NON_POINT_SHARE_RANGE = (0.1, 0.7)
 _MAX_SCATTER = 4.0
 """Standard deviation of scores of points, at most; at least 1."""
 _LOG_NON_POINT_SPREAD = np.log(8.0)
-"""Of each score of contacts that are no points; with the least share, it bounds what one contact counts."""
+"""Log range of each score of contacts that are no points; with the least share, it bounds what one
+contact counts."""
 
 
 class Evidence(NamedTuple):

@@ -46,7 +46,7 @@ CLEAR_NATS = 8.0
 """Margin of a pad without a fault over the diagnosed one that ends the diagnosis."""
 _MAX_SUM_NATS = 4 * SUSPICION_NATS
 _NATS_PER_LOGIT = 4.0
-"""Of evidence, for the stated confidence: what the model neglects is common to many contacts."""
+"""Evidence per logit of the stated confidence: what the model neglects is common to many contacts."""
 _WINDOWS = (64, 52, 44, 36, 28, 20, 12)
 """Contacts that are explained jointly, and last ones of them among which the fault may have begun."""
 _MIN_CONTACTS_TO_END, _MAX_CONTACTS_TO_END = 20, 40
@@ -61,18 +61,18 @@ _GAIN_STEP_STD = 0.1
 _CALIBRATED_GAIN_STD = 0.005
 """What temperature and age add to a channel's gain as known."""
 _TOLERANCE_WIDENING = 1.2
-"""Of every stated standard deviation: a part far out in its distribution is no fault."""
+"""Factor on every stated standard deviation: a part far out in its distribution is no fault."""
 _MIN_UNEXPLAINED_SHARE, _MAX_EXPLAINED_SHARE = 0.65, 0.35
 """Share of contacts that are no points, at which they are unexplained, and at which that ends."""
 _SIMILAR_KINDS = {FaultKind.GAIN_STEP, FaultKind.TORN_CORNER}
 _MAX_SILENT_FRACTION, _SHARE_CELLS = 0.005, 16
-"""Of the total current, in a channel that carries nothing; cells of each share of such a contact."""
+"""Fraction of the total current in a channel that carries nothing; cells of each share of such a contact."""
 _MIN_CONTACTS_SIMILAR = 12
 """Contacts of a fault of free size: fewer fit one of the sizes now and then."""
 _MIN_SILENT_SHARE, _SILENT_NATS = 0.9, 30.0
 """Share of contacts without a current in a dead electrode's channel, and what that adds to its evidence."""
 _SIMILAR_STEP = 3
-"""Of the hypotheses of gain steps and torn corners, those that one of a long pad must beat unsuspected."""
+"""Stride through hypotheses of gain steps and torn corners that one of a long pad must beat unsuspected."""
 _KINDS_WITH_ALTERNATIVES = (*_SIMILAR_KINDS, FaultKind.SWAPPED_CABLES)
 """Kinds that are diagnosed while it is open which electrodes are concerned."""
 

@@ -26,37 +26,31 @@ from handtouch.wire.faults import FaultKind
 
 _UNKNOWNS = 3
 MIN_CHANNELS = _UNKNOWNS + 1
-"""Of a pad whose contacts contradict anything."""
+"""Channels of a pad whose contacts can contradict a hypothesis."""
 _GAIN_TOLERANCE_STD = 0.02
-"""Of a channel's gain, as noise of log likelihood ratios, which raise suspicions only."""
-_SEARCH_TOLERANCE = 0.02  # of each current, in the search of the first node
+"""Error of a channel's gain, as noise of log likelihood ratios, which raise suspicions only."""
+_SEARCH_TOLERANCE = 0.02  # relative error of each current in the search of the first node
 _BOUND_STIFFNESS = 1e4
 _SEARCH_REACH = (1 / 6, 1 / 6, 1 / 8, 1 / 12, 1 / 24, 1 / 24)
 """Fractions of the sides that the steps of the search for scores go at most."""
-_NODES_PER_SIDE, _MAX_NODES_PER_SIDE = 25, 73  # of the shorter side, of the longer one of a long pad
+_NODES_PER_SIDE, _MAX_NODES_PER_SIDE = 25, 73
+"""Nodes along the shorter side, and along the longer one of a long pad."""
 _LONG_RATIO = 2.0
 """Ratio of the sides from which the nodes of the longer side are as close as those of the shorter one: the
 current of an electrode far along a strip falls by a factor e within a third of its width."""
 _FIRST_NODE, _LAST_NODE = 0.02, 0.98  # fractions of a side
-_MODEL_ERROR_FRACTION = 1e-3  # of the total: what the model neglects
-_TORN_MODEL_ERROR_FRACTION = 5e-3  # of the total: few sizes of cuts, coarse grids
-_SCORE_MODEL_ERROR_FRACTION = 3e-3  # of the total, for scores: the same for all hypotheses
+_MODEL_ERROR_FRACTION = 1e-3  # what the model neglects, over the total current
+_TORN_MODEL_ERROR_FRACTION = 5e-3  # the same for torn corners: few sizes of cuts, coarse grids
+_SCORE_MODEL_ERROR_FRACTION = 3e-3  # the same for scores, equal for all hypotheses
 _LONG_MODEL_ERROR_FRACTION, _LONG_MODEL_ERROR_OF_CURRENT = 5e-4, 0.03
-"""Of the total, and of a channel's own current, up to the above, on a long pad: far from an electrode, its
-current and the model's error decay alike, and carry the evidence."""
-_NON_POINT_PROBABILITIES = np.array(
-    [0.03, 0.5]
-)  # of all contacts: usually, and while two objects are handled
+"""Errors of the model on a long pad over the total and over a channel's current, up to the above: far from an
+electrode, its current and the model's error decay alike, and carry the evidence."""
+_NON_POINT_PROBABILITIES = np.array([0.03, 0.5])
+"""Fractions of all contacts that are no points: usually, and while two objects are handled."""
 _MIN_LOG_LIKELIHOOD, _MAX_SQUARED_MISFIT = -1e3, 1e6
 _LOG_NON_POINT_SPREAD = np.log(40.0)  # log ratio of the scatter of each score of contacts that are no points
-_CUT_FRACTIONS = (
-    0.2,
-    0.35,
-    0.5,
-    0.65,
-    0.8,
-    0.92,
-)  # of a side; the short side of a fingertip may be cut off whole
+_CUT_FRACTIONS = (0.2, 0.35, 0.5, 0.65, 0.8, 0.92)
+"""Sizes of cuts as fractions of a side; the short side of a fingertip may be cut off whole."""
 _CUT_STEP_STD = 0.5
 """Standard deviation of a cut's sizes about those of a hypothesis, in steps between these."""
 _GAIN_STEP_FACTORS = np.exp(np.append(np.arange(-19.5, -1), np.arange(1.5, 20)) * 0.07)

@@ -32,7 +32,7 @@ END_TOUCHED_NS = 30_000_000_000
 _LAGS = (1, 2)
 """Samples from before to after a step; a sample between them may show a part of it."""
 _MIN_STEP_COUNTS, _MIN_STEP_FRACTION = 100.0, 0.06
-"""Of the channel, also as a fraction of the total before an opening."""
+"""Step of the channel that opens or closes; the fraction is of the total before an opening."""
 _MAX_OPEN_FRACTION, _MAX_OPEN_SIGMA = 0.04, 5.0
 """Reading of the open channel, of the step and of its noise."""
 _MIN_SCALE, _MAX_SCALE = 0.5, 1.15
@@ -46,7 +46,7 @@ _TOUCHED_COUNTS = 250.0
 _STEPS_OF_DEAD = 2
 """Steps that count as much as the contacts after the opening of a dead electrode."""
 _MIN_RETURNED_COUNTS, _MIN_RETURNED_FRACTION = 100.0, 0.05
-"""Of a channel that isn't open any more, also of the total."""
+"""Reading of a channel that isn't open any more; the fraction is of the total."""
 _WRONG_PER_STEP = 0.2
 """Probability that one step isn't an opening or closing, for the stated confidence."""
 

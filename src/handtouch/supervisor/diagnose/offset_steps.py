@@ -26,7 +26,8 @@ _MAX_REST_FRACTION = 0.05
 """Change of any channel before and after, of the jump: a ramp is none."""
 _SAMPLES_OF_JUMP = 4
 _MAX_DIFFERENCE_COUNTS, _MAX_DIFFERENCE_FRACTION, _MAX_OTHER_DIFFERENCE_FRACTION = 5.0, 0.1, 0.03
-"""Of the lowest reading from the former one with the jump: counts, of the jump in its channel, in others."""
+"""Difference of the lowest reading from the former one plus the jump: counts, fraction of the jump in its
+channel and in others."""
 _CONFIDENCE = 0.998
 
 

@@ -58,15 +58,15 @@ _STILL_POSITION_STDS = np.array([0.0, 5e-5, 1.5e-4])
 _MAX_FLOOR_RATIO = 1.25
 _MAX_FADED_PART = 0.67
 _MIN_ABRUPT_PART = 0.35
-"""Of a load, within 3 s of its begin: a leak that grows with a time constant of 10 s or more has at most 0.33
-of what it has when it is classified, after 15 s; gum on a sheet that adapts, 0.4 and more."""
+"""Part of a load that appears within 3 s: a leak that grows with a time constant of 10 s or more has at most
+0.33 of what it has when it is classified, after 15 s; gum on a sheet that adapts, 0.4 and more."""
 _MIN_TREMOR_NATS = 3.0
 _MAX_TREMOR_NATS, _MAX_STILL_NATS = 15.0, 3.0
 _LASTING_CAUSES = np.array([0.0, 1.0, 0.0, 1.0, 1.0, 0.0])
 _PRESS_NATS, _MAX_PRESS_NATS = 1.5, 9.0
-"""Of a press elsewhere on the pad, after which the load is as before."""
+"""Evidence of a press elsewhere on the pad, after which the load is as before, and its greatest sum."""
 _OTHER_PAD_NATS, _MAX_OTHER_PAD_NATS = 0.2, 2.0
-"""Of a contact that begins on another pad."""
+"""Evidence of a contact that begins on another pad, and its greatest sum."""
 _HOLD_TIME_S, _HOLD_EXPONENT = 30.0, 1.5
 """An object is held for longer than t with probability (1 + t / time)^-exponent."""
 _MIN_PRESS_COUNTS, _MIN_PRESS_AWAY, _MAX_FLOOR_MOVE = 100.0, 0.12, 0.06
@@ -77,7 +77,7 @@ _SAME_BEGIN_NS = 1_000_000_000
 """From the begin of a load to a step that explains it."""
 _BEGIN_COUNTS = 250.0
 _MIN_SCATTER_BLOCKS = 6
-_NOISE_GAIN = 0.05  # of a block without a load
+_NOISE_GAIN = 0.05  # gain of the noise estimate per block without a load
 
 
 @dataclass
@@ -120,7 +120,7 @@ class StaticLoadDetector:
     def __init__(self, noise_counts: FloatArray, weights: Sequence[FloatArray]) -> None:
         self._weights = weights
         n, c = len(noise_counts), max(one.shape[-1] for one in weights)
-        self._variance = np.square(noise_counts) / GROUP_SAMPLES  # of a channel's short mean, as measured
+        self._variance = np.square(noise_counts) / GROUP_SAMPLES  # variance of a short mean, as measured
         self._zero = np.zeros((n, c))
         self._recent_floors: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._last_unloaded_ns = np.full(n, -1, dtype=np.int64)

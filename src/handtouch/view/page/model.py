@@ -302,7 +302,7 @@ def _contact_values(frame: wire.HandFrame, row: int) -> dict[str, Any]:
 
 
 def _status_text(codes: type[wire.PositionStatus] | type[wire.ForceStatus], code: int) -> str:
-    return codes(code).text if code < len(codes) else "unreliable"  # of a newer daemon
+    return codes(code).text if code < len(codes) else "unreliable"  # a code of a newer daemon
 
 
 def _rounded_vector(values: FloatArray) -> list[float]:

@@ -30,7 +30,7 @@ _HAND_SPACING_M = 0.06
 """Between hands."""
 _PAD_GAP_M = 0.008
 _CAMERA_SIDE_OFFSET, _CAMERA_HEIGHT_OFFSET = 0.75, 0.3
-"""Of the camera from the mean pad normal, as fractions of its distance: curled fingers hide less then."""
+"""Offset of the camera from the mean pad normal over its distance: curled fingers hide less then."""
 _VIEWER_ROTATION = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).T
 """Rotation of a pad without a URDF: its x points up, its z to a viewer at -y."""
 
