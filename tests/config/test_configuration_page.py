@@ -6,11 +6,12 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import create_model
+from pydantic import BaseModel, create_model
 
 from handtouch.config import surface_table
 from handtouch.config.base import Table
@@ -35,7 +36,7 @@ def examples(part: str, heading: str) -> dict[str, Any]:
 
 def sections() -> list[Any]:
     lists = {"bus": "[[bus]]", "hand": "[[hand]]", "hand.pad": "[[hand.pad]]"}
-    pages = {
+    pages: dict[str, tuple[str, Mapping[str, type[BaseModel]], dict[str, str]]] = {
         "deployment": (DEPLOYMENT, {name: TABLES[name] for name in TABLES if name}, lists),
         "node": (NODE, {**settings.TABLES, "trim": settings.Trim}, {"pad": "[[pad]]"}),
     }
@@ -62,7 +63,9 @@ def test_the_page_is_current() -> None:
 
 
 @pytest.mark.parametrize(("part", "heading", "model"), sections())
-def test_every_key_has_an_example_that_its_model_accepts(part: str, heading: str, model: type[Table]) -> None:
+def test_every_key_has_an_example_that_its_model_accepts(
+    part: str, heading: str, model: type[BaseModel]
+) -> None:
     found = examples(part, heading)
     for name, field in model.model_fields.items():
         key = field.alias or name
