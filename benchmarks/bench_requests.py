@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from collections.abc import Iterator
+from itertools import count as count_up
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
@@ -42,28 +44,33 @@ def quiet_deployment(folder: Path) -> Deployment:
     return deployment.model_copy(update={"daemon": daemon, "buses": buses})
 
 
-def worst_requests(names: list[str]) -> dict[str, list[dict[str, Any]]]:
-    """Return requests by the text of the table's row; those of a row are sent by turns."""
-    short = [name.split("/")[1] for name in names]
-    # as many wildcards as are allowed, in sets of characters, which cost most; the rest are names
-    sets = [[f"*[!{digit}{number}]" for digit in range(10)] + short + names for number in range(8)]
+def worst_requests(names: list[str], count: int) -> dict[str, list[dict[str, Any]]]:
+    """Return up to `count` requests by the text of the table's row; those of a row are sent by turns."""
+    short, numbers = [name.split("/")[1] for name in names], count_up(100)
+
+    def patterns() -> Iterator[list[str]]:
+        """Yield as many as are allowed: sets of characters, which cost most, then names; none twice."""
+        for number in islice(numbers, count):
+            yield ([f"*[!{number}{digit}]" for digit in range(10)] + short + names)[: 2 * len(names)]
+
     scene = {"lease_s": 3600.0, "outputs": ["position", "force"]}
     pad = {"hand": names[0].split("/")[0], "pad": short[0]}
     return {
         "`status`": [{"command": "status"}],
         "`snapshot`": [{"command": "snapshot"}],
         "`scene`, a client's with other patterns": [
-            {"command": "scene", "name": "worst", "links": links[:30], **scene} for links in sets
+            {"command": "scene", "name": "worst", "links": links, **scene} for links in patterns()
         ],
         "`scene`, the base": [
-            {"command": "scene", "links": links[:30], "outputs": ["position"]} for links in sets
+            {"command": "scene", "links": links, "outputs": ["position"]} for links in patterns()
         ],
         "`scene`, of no pad": [{"command": "scene", "name": "worst", "links": ["nothing*"], **scene}],
         "`disable`, `enable`": [
-            {"command": command, "pads": sets[0][:30], "name": "worst"} for command in ("disable", "enable")
+            {"command": command, "pads": links, "name": "worst"}
+            for links, command in zip(patterns(), cycle(("disable", "enable")), strict=False)
         ],
         "`calibrate`, read": [{"command": "calibrate", **pad}],
-        "`tare`, start": [{"command": "tare", "pads": sets[0][:30]}],
+        "`tare`, start": [{"command": "tare", "pads": links} for links in patterns()],
         "`log`": [{"command": "log", "level": "info"}],
         "no such command, 60 kB": [{"command": "x" * 60_000}],
         "not msgpack": [],
@@ -116,7 +123,7 @@ def measure(daemon: HandtouchDaemon, names: list[str], repeats: int) -> list[dic
         assert isinstance(answer, dict)
         assert answer["ok"], answer
     rows = []
-    for name, requests in worst_requests(names).items():
+    for name, requests in worst_requests(names, repeats).items():
         frames = [msgpack.packb({"v": 1, **request}) for request in requests] or [b"\xc1" * 60_000]
         spent = []
         for number in range(repeats):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from handtouch import wire
 from handtouch.client import columns
 from handtouch.config.tables import SceneRequest
+from handtouch.core.pad_patterns import PadNames
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import (
     CONTROL_OWNER,
@@ -20,8 +22,7 @@ from handtouch.core.scene import (
     MAX_CLIENTS,
     ActiveScenes,
     Demand,
-    merge_scenes,
-    select_pads,
+    SceneRequirements,
 )
 from handtouch.wire import PadState
 
@@ -36,23 +37,54 @@ scene_requests = st.builds(
 )
 
 
+PARTS = st.sampled_from(
+    ["*", "?", "[", "]", "!", "[a-m]", "[!lp]", "[]-a]", "[!]a]", "[a-]", "[p-a]", "z", "^"]
+)
+ODD_NAMES = [*NAMES, ("r", "a]b"), ("r", "a-b"), ("r", "a!b"), ("r", "a^b"), ("r", "a[b"), ("r", "a")]
+
+
 def test_patterns_select_pads_of_all_hands_or_of_one() -> None:
-    assert select_pads(["thumb_*"], NAMES).tolist() == [True, False, True, False]
-    assert select_pads(["left/*", "right/palm"], NAMES).tolist() == [True, True, False, True]
-    assert not select_pads([], NAMES).any()
+    pads = PadNames(NAMES)
+    assert pads.select(["thumb_*"]).tolist() == [True, False, True, False]
+    assert pads.select(["left/*", "right/palm"]).tolist() == [True, True, False, True]
+    assert not pads.select([]).any()
     with pytest.raises(ValueError, match=r"nowhere.*left/thumb_tip"):
-        select_pads(["*", "nowhere"], NAMES)
+        pads.select(["*", "nowhere"])
 
 
-@given(st.lists(scene_requests, max_size=4), scene_requests)
+@given(st.sampled_from(ODD_NAMES), st.booleans(), st.data())
+def test_patterns_match_as_those_of_files(name: tuple[str, str], of_hand: bool, data: st.DataObject) -> None:
+    """Patterns are names of which some characters were replaced."""
+    text = "/".join(name) if of_hand else name[1]
+    pattern = "".join(data.draw(st.just(character) | PARTS) for character in text)
+    full = pattern if "/" in pattern else f"*/{pattern}"
+    expected = [fnmatchcase("/".join(known), full) for known in ODD_NAMES]
+    if any(expected):
+        assert PadNames(ODD_NAMES).select([pattern]).tolist() == expected
+    else:
+        with pytest.raises(ValueError, match="no pad is named"):
+            PadNames(ODD_NAMES).select([pattern])
+
+
+def merged(scenes: list[SceneRequest]) -> SceneRequirements:
+    """Return what scenes require together: of a base, and of a client each."""
+    active = ActiveScenes(scenes[0], NAMES)
+    for number, scene in enumerate(scenes[1:]):
+        active.set_client_scene(f"c{number}", scene, SECOND, 0)
+    return active.requirements
+
+
+@given(st.lists(scene_requests, min_size=1, max_size=4), scene_requests)
 def test_an_additional_scene_removes_nothing(present: list[SceneRequest], more: SceneRequest) -> None:
-    before, after = merge_scenes(present, NAMES), merge_scenes([*present, more], NAMES)
+    before, after = merged(present), merged([*present, more])
     for name in ("pads", "position", "force", "raw"):
         assert (getattr(after, name) >= getattr(before, name)).all()
     assert (after.rate_hz >= before.rate_hz).all()
-    mine = select_pads(more.links, NAMES)
+    mine = PadNames(NAMES).select(more.links)
     assert (after.rate_hz[mine] >= (more.rate_hz or np.inf)).all()
-    assert merge_scenes([more, *present], NAMES).pads.tolist() == after.pads.tolist()
+    for name in ("position", "force", "raw"):
+        assert (getattr(after, name) >= (mine & (name in more.outputs))).all()
+    assert merged([more, *present]).pads.tolist() == after.pads.tolist()
 
 
 def test_a_clients_scene_ends_with_its_lease_unless_it_is_renewed() -> None:

@@ -83,9 +83,7 @@ class ContactDetector:
         arrays["saturated"] = view_memory(self.saturated)
         arrays["excess"] = view_memory(np.zeros(self._state.channels))
         arrays["offset_std_a"] = view_memory(self.offset_std_a)
-        self.stage = ContactDetection(
-            self._state.pads, self._state.memory() | arrays, view_memory(self._rows)
-        )
+        self.stage = ContactDetection(self._state.pads, self._state.memory | arrays, view_memory(self._rows))
 
     def is_fresh(self, pad: int) -> bool:
         """Return True if the pad sent its last expected sample."""

@@ -27,7 +27,7 @@ class ContactGroups:
     def __init__(self, within_m: FloatArray, hand: NDArray[np.intp], held: TickState) -> None:
         self.group_id = held.group_id
         self._contact_id, self._joined = held.grouped_contact_id, held.grouped
-        self._pairs = ContactPairs(held.memory(), view_memory(within_m**2), view_memory(hand))
+        self._pairs = ContactPairs(held.memory, view_memory(within_m**2), view_memory(hand))
 
     def update_groups(self) -> None:
         """Update the groups. Two contacts, one of which is unknown, stay joined or separate as before."""

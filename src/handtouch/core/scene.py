@@ -3,21 +3,19 @@
 A scene states what a task uses. The deployment file has one; a control request may replace it, and clients
 add their own for as long as they renew them. Of the union, only outputs with a subscriber are computed.
 
-Public names: `ActiveScenes`, `SceneRequirements`, `Demand`, `select_pads`, `FILE_OWNER`, `CONTROL_OWNER`,
-`WILDCARDS`.
+Public names: `ActiveScenes`, `SceneRequirements`, `Demand`, `FILE_OWNER`, `CONTROL_OWNER`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.config.problems import suggest_name
 from handtouch.config.tables import SceneRequest
+from handtouch.core.pad_patterns import PadName, PadNames
 from handtouch.wire import PERCEPT_KINDS
 
 FILE_OWNER, CONTROL_OWNER = "the deployment file", "control"
@@ -26,10 +24,8 @@ PATTERNS_PER_PAD = 2
 """Most patterns of one request, for each pad of the deployment"""
 MAX_CLIENT_CHARACTERS = 32_768
 """Length of the patterns of all clients' scenes together, which every answer contains"""
-WILDCARDS = frozenset("*?[")
 BoolArray = NDArray[np.bool_]
-PadName = tuple[str, str]
-"""hand, link"""
+_OUTPUTS = ("position", "force", "raw", "palm", "base", *PERCEPT_KINDS)
 
 
 class SceneRequirements(NamedTuple):
@@ -47,56 +43,31 @@ class SceneRequirements(NamedTuple):
     """(kinds, n), rows as PERCEPT_KINDS"""
 
 
-def select_pads(patterns: Sequence[str], names: Sequence[PadName]) -> BoolArray:
-    """Return the pads (hand, link) named by patterns such as "thumb_*" or "left/index_distal".
-
-    Raises ValueError for a pattern that matches none, among the first of so many that further ones can't
-    add a pad.
-    """
-    chosen = np.zeros(len(names), dtype=np.bool_)
-    for number, pattern in enumerate(patterns):
-        if number >= PATTERNS_PER_PAD * len(names) and chosen.all():
-            break
-        if WILDCARDS.isdisjoint(pattern):  # a name: an expression is compiled for a pattern
-            hits = [pattern in (link, f"{hand}/{link}") for hand, link in names]
-        else:
-            full = pattern if "/" in pattern else f"*/{pattern}"
-            hits = [fnmatchcase(f"{hand}/{link}", full) for hand, link in names]
-        if not any(hits):
-            known = [f"{hand}/{link}" for hand, link in names]
-            hint = suggest_name(pattern, known if "/" in pattern else [link for _, link in names])
-            raise ValueError(f'no pad is named "{pattern}"; {hint}there are {", ".join(known)}')
-        chosen |= np.array(hits)
-    return chosen
-
-
 class _ResolvedScene(NamedTuple):
-    """A scene with the pads (n,) that its patterns name: matching them costs more than all else."""
+    """A scene with the pads (n,) that its patterns name, and which of `_OUTPUTS` it has."""
 
     scene: SceneRequest
     pads: BoolArray
+    outputs: BoolArray
 
 
-def merge_scenes(scenes: Sequence[SceneRequest], names: Sequence[PadName]) -> SceneRequirements:
-    """Return the union of scenes over the pads. Raises ValueError for a pattern that matches none."""
-    resolved = [_ResolvedScene(scene, select_pads(scene.links, names)) for scene in scenes]
-    return _merge_scenes(resolved, len(names))
-
-
-def _merge_scenes(scenes: Sequence[_ResolvedScene], n: int) -> SceneRequirements:
+def _merge_scenes(scenes: Sequence[_ResolvedScene]) -> SceneRequirements:
     """Return the union of scenes over the pads."""
-    shape = (6 + len(PERCEPT_KINDS), n)
-    pads, position, force, raw, palm, base, *percepts = np.zeros(shape, dtype=np.bool_)
-    merged = SceneRequirements(pads, position, force, raw, palm, base, np.zeros(n), np.array(percepts))
-    outputs = {"position": position, "force": force, "raw": raw, "palm": palm, "base": base}
-    for scene, chosen in scenes:
-        pads[chosen] = True
-        for output, requested in outputs.items():
-            requested[chosen] |= output in scene.outputs
-        merged.percepts[np.outer([kind in scene.outputs for kind in PERCEPT_KINDS], chosen)] = True
-        position[chosen] |= bool({"palm", "base"} & set(scene.outputs))  # they need the position on the link
-        np.maximum(merged.rate_hz, scene.rate_hz or np.inf, out=merged.rate_hz, where=chosen)
-    return merged
+    pads = np.array([held.pads for held in scenes])
+    outputs = np.array([held.outputs for held in scenes])
+    rate_hz = np.array([[held.scene.rate_hz or np.inf] for held in scenes])
+    requested = outputs.T @ pads  # of truth values: any scene with this output and this pad
+    position, force, raw, palm, base, *percepts = requested
+    return SceneRequirements(
+        np.asarray(pads.any(axis=0)),
+        position | palm | base,  # palm and base need the position on the link
+        force,
+        raw,
+        palm,
+        base,
+        np.where(pads, rate_hz, 0.0).max(axis=0),
+        np.array(percepts),
+    )
 
 
 class ActiveScenes:
@@ -106,12 +77,17 @@ class ActiveScenes:
     """
 
     def __init__(self, file: SceneRequest, names: Sequence[PadName]) -> None:
-        self.names = list(names)
+        self.pads = PadNames(names)
         self.version = 0
         self._file = self._resolve(file)
         self._base: _ResolvedScene | None = None  # replaces the file's
         self._clients: dict[str, tuple[_ResolvedScene, int]] = {}
-        self.requirements = _merge_scenes([self._file], len(names))
+        self.requirements = _merge_scenes([self._file])
+
+    @property
+    def names(self) -> list[PadName]:
+        """Names of the pads."""
+        return self.pads.names
 
     @property
     def base(self) -> SceneRequest:
@@ -119,7 +95,8 @@ class ActiveScenes:
         return (self._base or self._file).scene
 
     def _resolve(self, scene: SceneRequest) -> _ResolvedScene:
-        return _ResolvedScene(scene, select_pads(scene.links, self.names))
+        outputs = np.array([output in scene.outputs for output in _OUTPUTS])
+        return _ResolvedScene(scene, self.pads.select(scene.links), outputs)
 
     def set_file(self, file: SceneRequest) -> None:
         """Set the deployment file's scene after a reload."""
@@ -184,11 +161,11 @@ class ActiveScenes:
                 "rate_hz": scene.rate_hz,
                 "lease_s": (ends[owner] - now_ns) * 1e-9 if owner in ends else None,
             }
-            for owner, (scene, _) in self.by_owner().items()
+            for owner, (scene, *_) in self.by_owner().items()
         ]
 
     def _merge(self) -> None:
-        self.requirements = _merge_scenes(list(self.by_owner().values()), len(self.names))
+        self.requirements = _merge_scenes(list(self.by_owner().values()))
         self.version += 1
 
 
@@ -244,6 +221,7 @@ class Demand:
         self._subscribers, self._tick_hz, self._apply = subscribers, tick_hz, apply
         self._merged_versions: object = None
         self._disabled_version = 0
+        self._described: list[dict[str, Any]] | None = None  # until something changes
         self.ticks_per_hand_frame = 1
         """ticks per hand frame, as the most frequently updated pad requires"""
         none = np.zeros(n, dtype=np.bool_)
@@ -270,14 +248,18 @@ class Demand:
 
     def describe_pads(self) -> list[dict[str, Any]]:
         """Return as plain values, for each pad: computed outputs, skipped ones with the reason, scenes and
-        subscriptions."""
-        scenes = {owner: held.pads for owner, held in self.scenes.by_owner().items()}
+        subscriptions; made once for each change of any."""
+        if self._described is None:
+            self._described = self._describe_pads()
+        return self._described
+
+    def _describe_pads(self) -> list[dict[str, Any]]:
+        scenes = {owner: held.pads.tolist() for owner, held in self.scenes.by_owner().items()}
+        subscriptions = sorted((p, p.decode("utf-8", "replace")) for p in self._subscribers.subscriptions)
         described = []
         for pad, (hand, link) in enumerate(self.scenes.names):
             topics = (f"contact/{hand}/{link}".encode(), f"hand/{hand}".encode())
-            owners = [owner for owner, chosen in scenes.items() if chosen[pad]]
-            prefixes = [p for p in self._subscribers.subscriptions if any(t.startswith(p) for t in topics)]
-            subscribed = sorted(prefix.decode("utf-8", "replace") for prefix in prefixes)
+            subscribed = [text for prefix, text in subscriptions if any(t.startswith(prefix) for t in topics)]
             computed, skipped = self._computed_and_skipped(pad, bool(subscribed))
             described.append(
                 {
@@ -285,7 +267,7 @@ class Demand:
                     "link": link,
                     "computed": computed,
                     "not_computed": skipped,
-                    "scenes": owners,
+                    "scenes": [owner for owner, chosen in scenes.items() if chosen[pad]],
                     "subscriptions": subscribed,
                     "rate_hz": self._tick_hz / int(self.requested.interval_ticks[pad]),
                 }
@@ -352,4 +334,5 @@ class Demand:
         )
         intervals = self.requested.interval_ticks[needed.pads]
         self.ticks_per_hand_frame = int(intervals.min()) if len(intervals) else 1
+        self._described = None
         self._apply(self.requested, needed, enabled, now_ns)

@@ -64,7 +64,7 @@ class ShearForces:
         """there is a shear pad"""
         self._state = state
         self._stage = ShearStage(
-            *([shear.table() for shear in pads], state.pads, state.memory()),
+            *([shear.table() for shear in pads], state.pads, state.memory),
             *(view_memory(position_status), view_memory(force_status), view_memory(np.zeros(_WORK))),
         )
 

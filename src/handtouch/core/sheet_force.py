@@ -328,7 +328,7 @@ class SheetForceCompensation:
         rows = [pad for group in self.groups for pad in group.pads.tolist()]
         pads = np.array(rows + [0] * (len(self._gain) - len(rows)), dtype=np.int64)
         return SheetStage(
-            self._held.memory(),
+            self._held.memory,
             view_memory(pads),
             len(rows),
             view_memory(self._gain),

@@ -12,7 +12,7 @@ import hashlib
 import math
 import typing
 from dataclasses import dataclass, field, fields
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated, Any
 
 import numpy as np
@@ -247,6 +247,7 @@ class TickState:
         usual = self.channels == _USUAL_CHANNELS
         return _declared_layout() + ("" if usual else f", {self.channels} channels")
 
+    @cached_property
     def memory(self) -> dict[str, memoryview[Any]]:
         """Return the memory of the arrays by name, flat, as the stages take it."""
         return {name: view_memory(getattr(self, name)) for name, _ in _stored_fields()}

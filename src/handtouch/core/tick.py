@@ -269,7 +269,7 @@ class TickProcessor:
             *(self.state.parts, self.contacts.saturated, self.state.noise_squared),
         )
         self.output = ContactColumns(
-            *(model.size, self.state.memory(), view_memory(model.position_unreliable), _VALUE_COLUMNS),
+            *(model.size, self.state.memory, view_memory(model.position_unreliable), _VALUE_COLUMNS),
             *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
             *(view_memory(columns.position_status), view_memory(columns.force_status)),
         )

@@ -328,7 +328,7 @@ class ContactMessageEncoder:
         message = np.zeros(ends[-1] + longest + _MAX_VALUE_BYTES, np.uint8)
         self._message = message.data
         self._stage = ContactEncoder(
-            tick.state.memory(),
+            tick.state.memory,
             *(view_memory(tick.columns.position_status), view_memory(tick.columns.force_status)),
             view_memory(tick.sheet_force.modelled),
             *(_text_memory(self._texts), view_memory(ends)),

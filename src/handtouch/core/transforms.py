@@ -68,7 +68,7 @@ class ContactTransforms:
             for name, at in FRAME_SLICES.items()
         }
         self._stage = FrameStage(
-            *(held.memory(), view_memory(published), view_memory(np.zeros(n, np.uint8))),
+            *(held.memory, view_memory(published), view_memory(np.zeros(n, np.uint8))),
             *(view_memory(np.zeros(12)), view_memory(np.zeros(9))),
         )
 

@@ -23,7 +23,7 @@ from handtouch.config.files import deployment_files
 from handtouch.config.tables import RequestedOutput, SceneRequest
 from handtouch.core.events import BaselineEvent, EvidenceEvent
 from handtouch.core.pipeline import Pipeline
-from handtouch.core.scene import PATTERNS_PER_PAD, WILDCARDS, Demand, select_pads
+from handtouch.core.scene import PATTERNS_PER_PAD, Demand
 from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
     Command,
@@ -45,8 +45,6 @@ _log = logging.getLogger("handtouch.control")
 
 PadPattern = Annotated[str, Field(max_length=129)]
 """Hand, slash and link, each of up to 64 characters"""
-_MAX_WILDCARDS = 20
-"""Wildcards in a request's patterns: a set costs the loop up to 0.1 ms, so that all cost 2 ms at most"""
 PadPatterns = Annotated[tuple[PadPattern, ...], Field(strict=False, min_length=1, max_length=1000)]
 ClientName = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=64)]
 CalibrationId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=64)]
@@ -196,12 +194,6 @@ class ControlCommands:
         most = PATTERNS_PER_PAD * len(self._pad_names)
         if len(patterns) > most:
             raise ValueError(f"{len(patterns)} patterns, and {most} are allowed; use wildcards")
-        wildcards = sum(pattern.count(character) for pattern in patterns for character in WILDCARDS)
-        if wildcards > _MAX_WILDCARDS:
-            raise ValueError(
-                f"the patterns have {wildcards} wildcards (*, ?, [), and {_MAX_WILDCARDS} are allowed; "
-                "name pads without them"
-            )
 
     def _scene_reply(self, now_ns: int) -> Reply:
         return {"scenes": self._demand.scenes.describe(now_ns), "pads": self._demand.describe_pads()}
@@ -348,7 +340,7 @@ class ControlCommands:
     def _select_pads(self, patterns: Sequence[str]) -> NDArray[np.bool_]:
         try:
             self._check_count(patterns)
-            return select_pads(patterns, self._pad_names)
+            return self._demand.scenes.pads.select(patterns)
         except ValueError as error:
             raise RefusedError(str(error)) from error
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, cast
 
 import numpy as np
@@ -41,6 +42,10 @@ _log = logging.getLogger("handtouch.health")
 _loop_log = logging.getLogger("handtouch.loop")
 _bus_log = logging.getLogger("handtouch.bus")
 
+_HEALTH_FIELDS, _SERVICE_FIELDS = (
+    (names := [field.name for field in fields(kind)], attrgetter(*names))
+    for kind in (wire.Health, wire.Service)
+)
 _WITHOUT_DIGITS = str.maketrans("", "", "0123456789")
 _BUS_LEVELS = {
     ErrorState.WARNING: logging.WARNING,
@@ -180,10 +185,10 @@ class StatusReporter:
 
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return service and health of all pads, for the control endpoint."""
-        pads = (replace(self._make_health(pad, now_ns), seq=0) for pad in range(len(self._pads)))
+        pads = (self._make_health(pad, now_ns) for pad in range(len(self._pads)))
         return {
-            "service": _message_fields(replace(self._make_service(now_ns), seq=0)),
-            "pads": [_message_fields(health) for health in pads],
+            "service": {**_message_fields(self._make_service(now_ns)), "seq": 0},
+            "pads": [{**_message_fields(health), "seq": 0} for health in pads],
         }
 
     def summary(self) -> str:
@@ -424,4 +429,5 @@ class _RateWindow:
 
 def _message_fields(message: wire.Health | wire.Service) -> dict[str, Any]:
     """Return the fields by name without the deep copies of `asdict`, which take milliseconds."""
-    return {field.name: getattr(message, field.name) for field in fields(message)}
+    names, values = _HEALTH_FIELDS if isinstance(message, wire.Health) else _SERVICE_FIELDS
+    return dict(zip(names, values(message), strict=True))
