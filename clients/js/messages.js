@@ -109,6 +109,7 @@ export class Frame {
   /** The values of a link in a column: a number, or the elements of its row. */
   at(name, link) {
     const values = this[name];
+    if (!ArrayBuffer.isView(values)) throw new RangeError(`no column ${name} in this frame`);
     const size = values.length / this.links.length;
     const row = this.row(link);
     return size === 1 ? values[row] : values.subarray(row * size, (row + 1) * size);

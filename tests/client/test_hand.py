@@ -62,6 +62,63 @@ def test_an_unknown_link_is_reported_with_the_closest_one() -> None:
         arrays.force_n["q"]
 
 
+def test_a_status_equals_its_name_and_prints_it() -> None:
+    arrays = _arrays(
+        _state_after(make_frame(state=(0, 1, 5), force_status=(0, 1, 2), position_status=(0, 1, 9)))
+    )
+    assert arrays.force_status["index_tip"] == "valid" == str(arrays.force_status["index_tip"])
+    assert arrays.force_status["index_tip"] is wire.ForceStatus.VALID
+    assert arrays.force_status["index_base"] != "valid"
+    assert (arrays.force_status == "valid").tolist() == [False, True, False]
+    assert arrays.state["index_base"] == "starting"
+    assert repr(arrays.state) == "{'thumb_tip': 'clear', 'index_tip': 'touched', 'index_base': 'starting'}"
+    assert arrays.position_status["index_base"] == 9  # of a later version
+    with pytest.raises(ValueError, match="'vaild' is no status; they are not_computed, valid"):
+        _ = arrays.force_status == "vaild"
+
+
+def test_sums_over_a_hand_leave_clear_pads_out_and_are_unknown_with_an_unknown_pad() -> None:
+    force_n = (np.nan, 2.0, 3.0)
+    arrays = _arrays(_state_after(make_frame(state=(0, 1, 1), force_n=force_n)))
+    assert (arrays.force_n.sum(), arrays.force_n.max(), arrays.force_n.mean()) == (5.0, 3.0, 2.5)
+    unknown = _arrays(_state_after(make_frame(state=(2, 1, 1), force_n=force_n)))
+    assert np.isnan([unknown.force_n.sum(), unknown.force_n.max()]).all()
+    clear = _arrays(_state_after(make_frame(state=(0, 0, 0))))
+    assert clear.force_n.sum() == 0.0
+    assert np.isnan(clear.force_n.max())
+
+
+def test_arithmetic_of_columns_returns_arrays() -> None:
+    arrays = _arrays(_state_after(make_frame(state=(1, 1, 1), force_n=(1.0, 2.0, 3.0))))
+    assert (2 * arrays.force_n + arrays.force_n).tolist() == [3.0, 6.0, 9.0]
+    assert (arrays.force_n > 1.5).tolist() == [False, True, True]
+    assert np.sqrt(arrays.force_n)[0] == 1.0
+
+
+def test_a_row_number_is_answered_with_the_links_and_the_array() -> None:
+    with pytest.raises(TypeError, match=r"0 is no link; the links are thumb_tip, .*\.array"):
+        _ = _arrays(_state_after(make_frame())).force_n[0]  # type: ignore[index]
+
+
+def test_covariances_are_matrices() -> None:
+    arrays = _arrays(_state_after(make_frame(covariance_m2=np.arange(27.0).reshape(3, 9))))
+    assert arrays.covariance_m2.array.shape == (3, 3, 3)
+    assert arrays.covariance_m2["index_tip"][0].tolist() == [9.0, 10.0, 11.0]
+
+
+def test_a_frame_prints_as_a_table_of_its_pads() -> None:
+    frame = make_frame(
+        state=(0, 1, 2), position_status=(0, 1, 0), force_status=(0, 1, 0), force_n=(np.nan, 1.25, np.nan),
+        force_std_n=(np.nan, 0.1, np.nan), position_m=np.full((3, 3), 0.0125),
+    )  # fmt: skip
+    lines = repr(_arrays(_state_after(frame))).splitlines()
+    assert lines[1:] == [
+        "  thumb_tip: clear",
+        "  index_tip: touched at (12.5, 12.5, 12.5) mm, 1.25 +- 0.10 N",
+        "  index_base: stale",
+    ]
+
+
 def test_an_output_that_no_scene_requests_is_an_error_that_names_the_output() -> None:
     with pytest.raises(LookupError, match='add "palm" to the outputs of the scene'):
         _ = HandArrays(make_frame()).palm_position_m

@@ -190,6 +190,30 @@ def test_robot_client_knows_the_hands_of_a_daemon_that_restarts(endpoints: dict[
                 made.close()
 
 
+def test_a_sequence_of_positions_has_the_order_of_the_daemon_s_joints(endpoints: dict[str, str]) -> None:
+    buffer = JointStateBuffer(("knuckle", "a/b", "tip"))
+    with zmq.Context() as context, Robot(endpoints["inputs"]) as robot:
+        with pytest.raises(LookupError, match="wait_connected"):
+            robot.send_joints("right", [0.1, 0.2, 0.3])
+        authenticator = Authenticator(context)
+        made = InputReceiver.open(context, endpoints["inputs"], authenticator, {"right": buffer}, PADS)
+        try:
+            assert _try_to_connect(robot, authenticator, made)
+            assert robot.joints("right") == buffer.names
+            with pytest.raises(ValueError, match="2 values for 3 joints: knuckle, a/b, tip"):
+                robot.send_joints("right", [0.1, 0.2])
+            robot.send_joints("right", np.array([0.1, 0.2, 0.3]), t_ns=NOW, position_std_rad=0.01)
+            for _ in range(1000):
+                made.poll(NOW)
+                if (found := buffer.interpolate(NOW)).position_rad[0] == 0.1:
+                    break
+                time.sleep(0.01)
+            assert found.position_rad.tolist() == [0.1, 0.2, 0.3]
+        finally:
+            made.close()
+            authenticator.close()
+
+
 def test_robot_client_refuses_missing_values(inputs: Any) -> None:
     with Robot(inputs.endpoint, key="") as robot:
         with pytest.raises(ValueError, match=r"same names.*b"):

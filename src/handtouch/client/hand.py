@@ -298,6 +298,12 @@ class Hand(LinkColumns):
         """Switch on the pads on links that match the patterns, as `DaemonControl.enable`."""
         return self.control.enable(*self._pads_on(links), name=name)
 
+    def __repr__(self) -> str:
+        """Return the newest frame as a table, or why there is none."""
+        if self._arrays is None:
+            return f"hand {self.name} at {self._connection.endpoint}: no frame"
+        return repr(self._arrays) + ("" if self.alive else "\n  too old: the daemon is silent or gone")
+
     def close(self) -> None:
         """Disconnect, and stop callbacks; raises what one of them raised."""
         self._closed.set()

@@ -1,6 +1,6 @@
 """Arrays of a hand frame by link, and the wrenches of its contacts.
 
-Public names: `LinkColumn`, `TouchedColumn`, `NotSampledError`, `HandArrays`.
+Public names: `LinkColumn`, `StatusColumn`, `TouchedColumn`, `NotSampledError`, `HandArrays`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from handtouch import wire
@@ -25,36 +26,54 @@ from handtouch.client.wrench import (
 )
 
 T = TypeVar("T")
+StatusT = TypeVar("StatusT", bound=wire.StatusCode)
 FrameName = Literal["link", "palm", "base"]
 """Frame of positions, normals and wrenches: of each link, or of the links that the deployment names."""
 FloatArray = NDArray[np.float64]
 _COLUMNS = wire.COLUMNS[wire.HandFrame]
+_OF_PADS = ("state", "sampled", "sample_ns", "total_current_a", "joints_age_s")
+"""Columns that also pads without a contact have a value in"""
 _SAMPLED = (wire.PadState.CLEAR, wire.PadState.TOUCHED)
 
 
-class LinkColumn(Mapping[str, T], Generic[T]):
+class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):
     """One quantity of every pad: a read-only mapping from link to value, and an array in `array`.
 
         hand.force_n["index_distal"]     # a number, or a row such as (3,) of position_m
         hand.force_n.array               # (n,) or (n, elements), in the order of hand.links
+        hand.force_n * 2, hand.force_n.max()
 
-    numpy accepts it as an array. An unknown link raises KeyError naming the closest one.
+    numpy accepts it as an array, and arithmetic returns arrays. An unknown link raises KeyError naming the
+    closest one. `sum`, `mean`, `min` and `max` are over pads that have a contact, or may have one: clear pads
+    don't count, and pads that aren't sampled make the result NaN.
     """
 
-    __slots__ = ("_rows", "array")
+    __slots__ = ("_rows", "array", "clear")
 
-    def __init__(self, array: NDArray[Any], rows: Mapping[str, int]) -> None:
+    def __init__(
+        self, array: NDArray[Any], rows: Mapping[str, int], clear: NDArray[np.bool_] | None = None
+    ) -> None:
         self.array = array
+        self.clear = np.zeros(len(array), np.bool_) if clear is None else clear
+        """(n,) pads that are sampled and have no contact, where the column is of contacts"""
         self._rows = rows
 
     def __getitem__(self, link: str) -> T:
-        try:
-            value = self.array[self._rows[link]]
-        except KeyError:
-            close = difflib.get_close_matches(link, self._rows, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"the links are {', '.join(self._rows)}"
-            raise KeyError(f"no link {link!r}; {hint}") from None
+        value = self.array[self._row(link)]
         return cast(T, value.item() if self.array.ndim == 1 else value)
+
+    def _row(self, link: str) -> int:
+        try:
+            return self._rows[link]
+        except (KeyError, TypeError):
+            names = ", ".join(self._rows)
+            if not isinstance(link, str):
+                raise TypeError(
+                    f"{link!r} is no link; the links are {names}, and rows of numbers are in .array"
+                ) from None
+            close = difflib.get_close_matches(link, self._rows, 1)
+            hint = f"did you mean {close[0]!r}?" if close else f"the links are {names}"
+            raise KeyError(f"no link {link!r}; {hint}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)
@@ -65,8 +84,83 @@ class LinkColumn(Mapping[str, T], Generic[T]):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.array, dtype=dtype, copy=copy)
 
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        arrays = (value.array if isinstance(value, LinkColumn) else value for value in inputs)
+        return getattr(ufunc, method)(*arrays, **options)
+
+    def __eq__(self, other: object) -> Any:
+        return dict(self) == dict(other) if isinstance(other, Mapping) else self.array == other
+
+    def __ne__(self, other: object) -> Any:
+        return dict(self) != dict(other) if isinstance(other, Mapping) else self.array != other
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def sum(self) -> Any:
+        """Return the sum, 0 without a contact; of rows by element."""
+        return self.array[~self.clear].sum(axis=0)
+
+    def mean(self) -> Any:
+        """Return the mean, NaN without a contact."""
+        return self._of_touched(np.mean)
+
+    def min(self) -> Any:
+        """Return the least value, NaN without a contact."""
+        return self._of_touched(np.min)
+
+    def max(self) -> Any:
+        """Return the greatest value, NaN without a contact."""
+        return self._of_touched(np.max)
+
+    def _of_touched(self, function: Callable[..., Any]) -> Any:
+        values = self.array[~self.clear]
+        return function(values, axis=0) if len(values) else np.full(self.array.shape[1:], np.nan)[()]
+
     def __repr__(self) -> str:
         return repr(dict(self))
+
+
+class StatusColumn(LinkColumn[StatusT]):
+    """A status of every pad; its values are codes that equal their names.
+
+    hand.force_status["index_distal"] == "valid"
+    hand.force_status == "valid"         # (n,) booleans
+    hand.force_status.array              # (n,) codes
+
+    """
+
+    __slots__ = ("_codes",)
+
+    def __init__(self, array: NDArray[Any], rows: Mapping[str, int], codes: type[StatusT]) -> None:
+        super().__init__(array, rows)
+        self._codes = codes
+
+    def __getitem__(self, link: str) -> StatusT:
+        code = int(self.array[self._row(link)])
+        try:
+            return self._codes(code)
+        except ValueError:  # of a later version
+            return cast(StatusT, code)
+
+    def __eq__(self, other: object) -> Any:
+        return super().__eq__(self._code(other))
+
+    def __ne__(self, other: object) -> Any:
+        return super().__ne__(self._code(other))
+
+    __hash__ = None
+
+    def _code(self, other: object) -> object:
+        """Return the code of a name. Raises ValueError for an unknown one, which would never be equal."""
+        if not isinstance(other, str):
+            return other
+        for code in self._codes:
+            if str(code) == other:
+                return code
+        raise ValueError(f"{other!r} is no status; they are {', '.join(map(str, self._codes))}")
+
+    def __repr__(self) -> str:
+        return repr({link: str(code) for link, code in self.items()})
 
 
 class NotSampledError(KeyError):
@@ -94,8 +188,7 @@ class TouchedColumn(LinkColumn[bool]):
         self._reason = reason or (lambda _: "its frame is old")
 
     def __getitem__(self, link: str) -> bool:
-        super().__getitem__(link)  # is there such a link?
-        row = self._rows[link]
+        row = self._row(link)
         if np.ma.getmaskarray(self.array)[row]:
             raise NotSampledError(f"whether {link!r} is touched isn't known: {self._reason(row)}")
         return bool(self.array[row])
@@ -128,7 +221,7 @@ class LinkColumns:
     force vectors for a hand without shear pads.
     """
 
-    state = _FrameColumn[int]("State of the pad, a `wire.PadState`; only CLEAR means no contact.")
+    state = _FrameColumn[wire.PadState]("State of the pad, a `wire.PadState`; only CLEAR means no contact.")
     touched = _FrameColumn[bool](
         "True where the pad has a contact. Reading it of a pad that isn't sampled raises NotSampledError; "
         "`touched.get(link)` returns None there, and `touched.array` is masked."
@@ -139,28 +232,28 @@ class LinkColumns:
     total_current_a = _FrameColumn[float]("Total current of the newest sample [A].")
     position_m = _FrameColumn[FloatArray]("(3,) contact position in the link's frame [m].")
     normal = _FrameColumn[FloatArray]("(3,) outward unit normal of the pad at the position.")
-    covariance_m2 = _FrameColumn[FloatArray]("(9,) covariance of the position, row by row [m^2].")
-    mount_covariance_m2 = _FrameColumn[FloatArray]("(9,) part of it by the pad's mount [m^2].")
+    covariance_m2 = _FrameColumn[FloatArray]("(3, 3) covariance of the position [m^2].")
+    mount_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) part of it by the pad's mount [m^2].")
     pad_m = _FrameColumn[FloatArray]("(2,) arc lengths on the pad, from the electrodes x0 and y0 [m].")
-    position_status = _FrameColumn[int]("Status of the position, a `wire.PositionStatus`.")
+    position_status = _FrameColumn[wire.PositionStatus]("Status of the position, a `wire.PositionStatus`.")
     force_n = _FrameColumn[float]("Normal force [N].")
     force_std_n = _FrameColumn[float]("Its standard deviation [N]; NaN where the force is a lower bound.")
-    force_status = _FrameColumn[int]("Status of the force, a `wire.ForceStatus`.")
+    force_status = _FrameColumn[wire.ForceStatus]("Status of the force, a `wire.ForceStatus`.")
     residual = _FrameColumn[float]("Deviation from a point contact, as in `wire.Contact`.")
     residual_std = _FrameColumn[float]("Its standard deviation for a point contact.")
     group = _FrameColumn[int]("The same for contacts that one object may bridge, 0 without contact.")
-    palm_status = _FrameColumn[int]("Status in the palm's frame, a `wire.FrameStatus`.")
+    palm_status = _FrameColumn[wire.FrameStatus]("Status in the palm's frame, a `wire.FrameStatus`.")
     palm_position_m = _FrameColumn[FloatArray]("(3,) contact position in the palm's frame [m].")
     palm_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the palm's frame.")
-    palm_covariance_m2 = _FrameColumn[FloatArray]("(9,) its covariance in the palm's frame [m^2].")
-    base_status = _FrameColumn[int]("Status in the base's frame, a `wire.FrameStatus`.")
+    palm_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) its covariance in the palm's frame [m^2].")
+    base_status = _FrameColumn[wire.FrameStatus]("Status in the base's frame, a `wire.FrameStatus`.")
     base_position_m = _FrameColumn[FloatArray]("(3,) contact position in the base's frame [m].")
     base_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the base's frame.")
-    base_covariance_m2 = _FrameColumn[FloatArray]("(9,) its covariance in the base's frame [m^2].")
+    base_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) its covariance in the base's frame [m^2].")
     joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state [s].")
-    force_vector_status = _FrameColumn[int]("Status of the force vector, a `wire.ForceStatus`.")
+    force_vector_status = _FrameColumn[wire.ForceStatus]("Status of the force vector, a `wire.ForceStatus`.")
     force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the link's frame [N].")
-    force_vector_covariance_n2 = _FrameColumn[FloatArray]("(9,) its covariance, row by row [N^2].")
+    force_vector_covariance_n2 = _FrameColumn[FloatArray]("(3, 3) its covariance [N^2].")
     palm_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the palm's frame [N].")
     base_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the base's frame [N].")
 
@@ -285,7 +378,7 @@ class HandArrays(LinkColumns):
         position_m, normal, covariance_m2 = (
             self.column(prefix + name).array[rows].astype(np.float64) for name in names
         )
-        return position_m, normal, covariance_m2.reshape(-1, 3, 3)
+        return position_m, normal, covariance_m2
 
     def _forces(self, rows: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
         force_n, std_n = (c.array[rows].astype(np.float64) for c in (self.force_n, self.force_std_n))
@@ -298,9 +391,8 @@ class HandArrays(LinkColumns):
             return ()
         valid = self.force_vector_status.array[rows] == wire.ForceStatus.VALID
         names = ("force_vector_n", "normal", "force_vector_covariance_n2")
-        vector_n, normal, flat = (self.column(name).array[rows].astype(np.float64) for name in names)
+        vector_n, normal, covariance_n2 = (self.column(name).array[rows].astype(np.float64) for name in names)
         vector_n[~valid] = np.nan
-        covariance_n2 = flat.reshape(-1, 3, 3)
         if frame == "link":
             return vector_n, covariance_n2
         turned_n, turned = (self.column(prefix + name).array[rows].astype(np.float64) for name in names[:2])
@@ -322,7 +414,11 @@ class HandArrays(LinkColumns):
             is_unknown = ~np.isin(state, _SAMPLED)
             touched = np.ma.MaskedArray(state == wire.PadState.TOUCHED, mask=is_unknown)
             return TouchedColumn(touched, self._rows, self._why_unknown)
-        return LinkColumn(self._make_array(name), self._rows)
+        codes = _COLUMNS[name].codes if name in _COLUMNS else None
+        if codes is not None:
+            return StatusColumn(self._make_array(name), self._rows, codes)
+        is_of_contact = name not in _OF_PADS
+        return LinkColumn(self._make_array(name), self._rows, self._is_clear if is_of_contact else None)
 
     def _why_unknown(self, row: int) -> str:
         state, sample_ns = int(self.state.array[row]), int(self.sample_ns.array[row])
@@ -330,6 +426,20 @@ class HandArrays(LinkColumns):
         age = f"its last sample is {age_s:.3f} s old" if sample_ns else "no sample yet"
         known = [member.text for member in wire.PadState if member == state]
         return f"the pad is {known[0] if known else f'in state {state}'}, {age}"
+
+    def __repr__(self) -> str:
+        """A line for each pad: link, state, position and force."""
+        lines = [f"hand {self.frame.hand}, tick {self.frame.tick}"]
+        for link, state in self.state.items():
+            line = f"{link}: {state}"
+            if state == "touched":
+                x, y, z = 1e3 * self.position_m[link]
+                line += f" at ({x:.1f}, {y:.1f}, {z:.1f}) mm" if self.position_status[link] == "valid" else ""
+                force, std = self.force_n[link], self.force_std_n[link]
+                status = self.force_status[link]
+                line += f", {force:.2f} +- {std:.2f} N" if status == "valid" else f", force {status}"
+            lines.append(line)
+        return "\n  ".join(lines)
 
     def _make_array(self, name: str) -> NDArray[Any]:
         if name == "sampled":
@@ -340,4 +450,5 @@ class HandArrays(LinkColumns):
         if not data and self.links:
             output = name.split("_")[0] if name != "group" else "palm"
             raise LookupError(f'no scene requests {name}; add "{output}" to the outputs of the scene')
-        return _COLUMNS[name].to_array(data)
+        array = _COLUMNS[name].to_array(data)
+        return array.reshape(-1, 3, 3) if array.shape[1:] == (9,) else array

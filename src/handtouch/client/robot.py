@@ -2,6 +2,7 @@
 
     with handtouch.Robot() as robot:
         robot.send_joints("right", {"index_mcp": 0.4, "index_pip": 0.7}, t_ns=time.monotonic_ns())
+        robot.send_joints("right", positions)   # an array in the order of robot.joints("right")
 
 Public names: `Robot`.
 """
@@ -25,8 +26,11 @@ from handtouch.wire.inputs import (
     LinkForces,
     encode,
     hands_in_prefix,
+    joints_in_prefix,
 )
 
+JointValues = Mapping[str, float] | Sequence[float] | NDArray[np.float64]
+"""Values by joint name, or of all joints in the hand's order"""
 _QUEUE_MESSAGES = 16
 _LINGER_MS = 200
 
@@ -44,29 +48,45 @@ class Robot:
     def __init__(self, endpoint: str = INPUTS_ENDPOINT, key: Path | str | None = None) -> None:
         self.endpoint = endpoint
         self._hands: frozenset[str] = frozenset()  # hands of the connected daemon
+        self._joints: dict[str, tuple[str, ...]] = {}
         options = {zmq.SNDHWM: _QUEUE_MESSAGES, zmq.LINGER: _LINGER_MS, **RECONNECT_OPTIONS}
         options[zmq.XPUB_VERBOSE] = 1  # report also what a daemon before a restart had subscribed to
         self._connection = Connection.open(zmq.XPUB, endpoint, key, options)
 
+    def joints(self, hand: str) -> tuple[str, ...]:
+        """Return the joints of a hand in the daemon's order, those of its URDF that move its links.
+
+        Raises LookupError before a daemon has connected, and for a hand without joints.
+        """
+        self._connection.poll(0)
+        self._read_subscriptions()
+        if hand not in self._joints:
+            raise LookupError(
+                f"the joints of hand {hand!r} aren't known: call wait_connected() first; it needs a URDF in "
+                "the deployment"
+            )
+        return self._joints[hand]
+
     def send_joints(
         self,
         hand: str,
-        position_rad: Mapping[str, float],
+        position_rad: JointValues,
         *,
         t_ns: int | None = None,
-        velocity_rad_s: Mapping[str, float] | None = None,
-        position_std_rad: Mapping[str, float] | float | None = None,
+        velocity_rad_s: JointValues | None = None,
+        position_std_rad: JointValues | float | None = None,
         gravity: Sequence[float] | None = None,
     ) -> None:
         """Send joint positions of a hand, by joint name, at `t_ns` of time.monotonic_ns() (None: now).
 
-        Prismatic joints in metres. Velocities and standard deviations are of the same joints; a single
-        deviation applies to all. gravity: (3,) its direction in the frame of the hand's base, of any length;
-        overrides the deployment's, for a hand on an arm that its URDF doesn't contain. Raises ValueError for
-        mappings with different joints. The daemon leaves out joints whose position isn't finite, and counts
-        them.
+        A sequence has the order of `joints(hand)`, and all of them. Prismatic joints in metres. Velocities
+        and standard deviations are of the same joints; a single deviation applies to all. gravity: (3,) its
+        direction in the frame of the hand's base, of any length; overrides the deployment's, for a hand on an
+        arm that its URDF doesn't contain. Raises ValueError for mappings with different joints and for
+        sequences of another length, LookupError as `joints`. The daemon leaves out joints whose position
+        isn't finite, and counts them.
         """
-        names = tuple(position_rad)
+        names = tuple(position_rad) if isinstance(position_rad, Mapping) else self.joints(hand)
         std = position_std_rad
         if isinstance(std, (int, float)):
             std = dict.fromkeys(names, float(std))
@@ -131,11 +151,17 @@ class Robot:
             hands = hands_in_prefix(request[1:].decode("utf-8", "replace"))
             if hands and request[:1] == b"\x01":
                 self._hands = hands
+            elif joints := joints_in_prefix(request[1:].decode("utf-8", "replace")):
+                self._joints |= joints if request[:1] == b"\x01" else {}
             elif hands == self._hands:  # the daemon disconnected
                 self._hands = frozenset()
 
 
-def _to_array(values: Mapping[str, float], names: tuple[str, ...]) -> NDArray[np.float64]:
+def _to_array(values: JointValues, names: tuple[str, ...]) -> NDArray[np.float64]:
+    if not isinstance(values, Mapping):
+        if np.shape(values) != (len(names),):
+            raise ValueError(f"{len(values)} values for {len(names)} joints: {', '.join(names)}")
+        return np.array(values, np.float64)
     if not names or values.keys() != set(names):
         differ = ", ".join(sorted(set(names) ^ values.keys())) or "none given"
         raise ValueError(f"all mappings must have the same names, one or more: {differ}")

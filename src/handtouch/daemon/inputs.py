@@ -28,6 +28,7 @@ from handtouch.wire.inputs import (
     LinkForces,
     decode,
     hands_prefix,
+    joints_prefix,
 )
 
 DROP_CAUSES = {
@@ -99,6 +100,8 @@ class InputReceiver:
         socket.setsockopt(zmq.RCVHWM, _QUEUE_MESSAGES)
         socket.subscribe("")  # everything, to count misspelt topics
         socket.subscribe(hands_prefix(hand for hand, _ in pads))
+        for hand, buffer in joints.items():
+            socket.subscribe(joints_prefix(hand, buffer.names))
         bound = bind_endpoint(socket, endpoint, "the inputs endpoint", authenticator, "inputs")
         return cls(socket, bound, joints, pads, on_force_reference, authenticator)
 

@@ -42,7 +42,14 @@ from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
 from handtouch.wire.service import Service
-from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PadStateName, PositionStatus
+from handtouch.wire.status import (
+    ForceStatus,
+    FrameStatus,
+    PadState,
+    PadStateName,
+    PositionStatus,
+    StatusCode,
+)
 from handtouch.wire.topics import (
     COLUMNS,
     HEALTH,
@@ -96,6 +103,7 @@ __all__ = [
     "Service",
     "ShearStatusName",
     "StateSnapshot",
+    "StatusCode",
     "TickInputs",
     "Topic",
     "UnknownTopicError",

@@ -1,8 +1,8 @@
 """Inputs of the daemon from a robot: joint states and reference forces.
 
 Public names: `JointState`, `LinkForces`, `encode`, `decode`, `INPUT_TOPICS`, `hands_prefix`,
-`hands_in_prefix`. The keys are in docs/wire.md, "Inputs". SI units; `t_ns` is of the host's monotonic clock,
-as that of samples.
+`hands_in_prefix`, `joints_prefix`, `joints_in_prefix`. The keys are in docs/wire.md, "Inputs". SI units;
+`t_ns` is of the host's monotonic clock, as that of samples.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ _MAX_NAMES = 1000
 _MAX_NAME_CHARACTERS = 200
 _MAX_T_NS = 2**63 - 1
 _MAX_NEGATIVE_SIGMA = 3
-_HANDS_PREFIX = "hands/"
+_HANDS_PREFIX, _JOINTS_PREFIX = "hands/", "hand_joints/"
+"""Of subscriptions; ZeroMQ sends them in alphabetical order, so that joints are known once the hands are"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +136,19 @@ def hands_prefix(hands: Iterable[str]) -> str:
 def hands_in_prefix(prefix: str) -> frozenset[str]:
     """Return the hands that such a subscription names; empty for any other."""
     return frozenset(prefix[len(_HANDS_PREFIX) :].split("/") if prefix.startswith(_HANDS_PREFIX) else ())
+
+
+def joints_prefix(hand: str, joints: Iterable[str]) -> str:
+    """Return the subscription by which a daemon names the joints of a hand in their order."""
+    return _JOINTS_PREFIX + "\0".join((hand, *joints))
+
+
+def joints_in_prefix(prefix: str) -> dict[str, tuple[str, ...]]:
+    """Return the hand that such a subscription names, with its joints; empty for any other."""
+    if not prefix.startswith(_JOINTS_PREFIX):
+        return {}
+    hand, *joints = prefix[len(_JOINTS_PREFIX) :].split("\0")
+    return {hand: tuple(joints)}
 
 
 def _check_time(t_ns: int | None) -> None:

@@ -1,7 +1,7 @@
 """Status codes: numbers in columns, lower-case names in other messages (`status.text`).
 
-Public names: `MAX_SILENT_PERIODS`, `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`, and the type
-of the names of each, `PadStateName` and so on. A later version may add codes.
+Public names: `MAX_SILENT_PERIODS`, `StatusCode`, `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`,
+and the type of the names of each, `PadStateName` and so on. A later version may add codes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,27 @@ Chosen: two samples lost in a row are no fault yet; with four, a client learns o
 """
 
 
-class PadState(IntEnum):
+class StatusCode(IntEnum):
+    """A code that prints as its name in messages without columns, and equals it: `code == "valid"`."""
+
+    @property
+    def text(self) -> str:
+        """Name of the code in messages without columns."""
+        return self.name.lower()
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __eq__(self, other: object) -> bool:
+        return self.text == other if isinstance(other, str) else int.__eq__(self, other)
+
+    def __ne__(self, other: object) -> bool:
+        return self.text != other if isinstance(other, str) else int.__ne__(self, other)
+
+    __hash__ = int.__hash__
+
+
+class PadState(StatusCode):
     """State of a pad: "no contact" is CLEAR only, not STALE, LOST or FAULTED."""
 
     CLEAR = 0
@@ -46,7 +66,7 @@ class PadState(IntEnum):
         return cast(PadStateName, self.name.lower())
 
 
-class PositionStatus(IntEnum):
+class PositionStatus(StatusCode):
     """Status of a contact's position."""
 
     NOT_COMPUTED = 0
@@ -64,7 +84,7 @@ class PositionStatus(IntEnum):
         return cast(PositionStatusName, self.name.lower())
 
 
-class ForceStatus(IntEnum):
+class ForceStatus(StatusCode):
     """Status of a contact's force."""
 
     NOT_COMPUTED = 0
@@ -82,7 +102,7 @@ class ForceStatus(IntEnum):
         return cast(ForceStatusName, self.name.lower())
 
 
-class FrameStatus(IntEnum):
+class FrameStatus(StatusCode):
     """Status of a contact's position in the frame of the palm or the base."""
 
     NOT_COMPUTED = 0
