@@ -91,12 +91,20 @@ def test_late_pads_of_a_bus_without_sync_name_the_sync(rig: Any) -> None:
     assert all("no SYNC on bus can for " in event.reason for event in events)
 
 
+def test_pads_that_are_late_together_on_a_real_bus_name_the_host_and_then_the_cable(rig: Any) -> None:
+    rig.port.bus = rig.port.bus.model_copy(update={"interface": "socketcan"})
+    rig.boot()
+    rig.wire.lose = {0x281, 0x282, 0x283}
+    events = rig.run(100)
+    assert all("check the host's load, then this bus's cable" in event.reason for event in events)
+
+
 def test_pads_that_are_late_together_name_the_bus(rig: Any) -> None:
     rig.boot()
     rig.wire.lose = {0x281, 0x282, 0x283}
     events = rig.run(100)
     assert [event.new_state for event in events] == [NodeState.STALE] * 3
-    assert all("as from every pad of bus can; check this bus's cable" in event.reason for event in events)
+    assert all("as from every pad of bus can; check that the nodes'" in event.reason for event in events)
 
 
 def test_one_late_pad_names_its_node(rig: Any) -> None:
@@ -142,7 +150,7 @@ def test_nodes_lost_together_name_the_bus_and_one_lost_alone_doesnt(rig: Any) ->
     rig.wire.cut = {1, 2, 3}
     lost = [event for event in rig.run(600) if event.new_state is NodeState.ABSENT]
     assert {event.slot for event in lost} == {1, 2}
-    assert all("as from every node of bus can; check this bus's cable" in event.reason for event in lost)
+    assert all("as from every node of bus can; check that the nodes'" in event.reason for event in lost)
 
 
 @pytest.mark.parametrize("role", ["master", "listener"])
@@ -169,7 +177,7 @@ def test_a_short_pause_of_the_loop_is_not_the_cause_of_a_long_silence(rig: Any) 
     rig.master.excuse_pause(20 * MS, rig.t_ns)
     lost = [event for event in rig.run(600) if event.new_state is NodeState.ABSENT]
     assert len(lost) == 3
-    assert all("check this bus's cable" in event.reason for event in lost)
+    assert all("check that the nodes' programs run" in event.reason for event in lost)
     assert not any("loop was late" in event.reason for event in lost)
 
 

@@ -18,6 +18,7 @@ from handtouch.bridge.options import (
     bridged_daemons,
     is_key_part,
 )
+from handtouch.host.installation import extra_command
 
 if TYPE_CHECKING:
     from handtouch.bridge.relay import Relay
@@ -50,7 +51,7 @@ def _open_relays(options: BridgeOptions, opened: ExitStack) -> Iterator[Relay]:
     try:
         from handtouch.bridge import relay
     except ImportError as error:
-        raise BridgeError(f"Zenoh is missing ({error}): pip install 'handtouch[zenoh]'") from error
+        raise BridgeError(f"Zenoh is missing ({error}): {extra_command('zenoh')}") from error
     session = opened.enter_context(relay.open_session(options))
     for daemon in daemons:
         root = f"{options.prefix}/{daemon.name}"

@@ -99,6 +99,7 @@ def run(
     `lower_rate`. Exit status 0; 1 if no contact was received; 2 for an unusable configuration.
     """
     logging.basicConfig(level=logging.ERROR)
+    logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
     try:
         deployment = _with_palm_output(
             in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))

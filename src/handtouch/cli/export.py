@@ -9,6 +9,7 @@ from pathlib import Path
 from handtouch.cli.errors import file_error_text
 from handtouch.cli.options import add_json, add_output
 from handtouch.cli.progress import ProgressLine
+from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 
@@ -38,7 +39,7 @@ def run(path: Path, folder: Path, format_: str, as_json: bool = False) -> int:
         try:
             import pyarrow  # noqa: F401
         except ImportError as error:
-            print(f"--format parquet: {error}; pip install 'handtouch[export]', or use csv", file=sys.stderr)
+            print(f"--format parquet: {error}; {extra_command('export')}, or use csv", file=sys.stderr)
             return 2
     try:
         recording = Recording(path)

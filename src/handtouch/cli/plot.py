@@ -9,6 +9,7 @@ from pathlib import Path
 from handtouch.cli.errors import file_error_text
 from handtouch.cli.options import add_json, add_output, positive_number
 from handtouch.cli.progress import ProgressLine
+from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 
@@ -47,7 +48,7 @@ def run(
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        print(f"handtouch plot: {error}; pip install 'handtouch[figures]'", file=sys.stderr)
+        print(f"handtouch plot: {error}; {extra_command('figures')}", file=sys.stderr)
         return 2
     try:
         recording = Recording(path)

@@ -15,12 +15,13 @@ from handtouch.cli.errors import file_error_text
 from handtouch.cli.options import add_endpoint, add_json, add_output, add_percepts, positive_number
 from handtouch.cli.progress import ProgressLine
 from handtouch.config import ConfigError
+from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
 
 NO_MESSAGE_TEXT = "no message received; is `handtouch run` running?"
-NO_FOXGLOVE_TEXT = "without Foxglove's topics (/handtouch/...); for them: pip install 'handtouch[foxglove]'"
+NO_FOXGLOVE_TEXT = f"without Foxglove's topics (/handtouch/...); for them: {extra_command('foxglove')}"
 _MAX_SHOWN_MINUTES = 600
 
 

@@ -10,6 +10,7 @@ import webbrowser
 
 from handtouch.cli.options import add_endpoint, add_percepts, integer, positive_number
 from handtouch.client import connect
+from handtouch.host.installation import extra_command
 from handtouch.host.signals import stop_on_signals
 from handtouch.view import page
 from handtouch.view.page.model import PageModel
@@ -102,7 +103,7 @@ def _serve_foxglove(
     try:
         from handtouch.view import foxglove
     except ImportError as error:
-        print(f"Foxglove's package is missing ({error}): pip install 'handtouch[foxglove]'", file=sys.stderr)
+        print(f"Foxglove's package is missing ({error}): {extra_command('foxglove')}", file=sys.stderr)
         return 2
     patterns = (*foxglove.PATTERNS, *[page.PERCEPT_PATTERN] * percepts)
     port = foxglove.PORT if port is None else port

@@ -22,6 +22,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
+from handtouch.host.installation import compile_command
+
 STAGES = (
     *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
     *("kinematics", "frames", "publish", "groups", "shear", "evidence"),
@@ -68,8 +70,8 @@ class Compilation(NamedTuple):
         if not missing:
             return cls(True, "")
         if any((_FOLDER / "_compiled").glob("*.so")):
-            return cls(False, "the compiled modules are of other sources; run `make dev`")
-        return cls(False, "they were never compiled on this machine; run `make dev`")
+            return cls(False, f"the compiled modules are of other sources; {compile_command()}")
+        return cls(False, f"they were never compiled on this machine; {compile_command()}")
 
 
 @cache

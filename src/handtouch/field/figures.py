@@ -65,7 +65,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as problem:
-        raise ImportError("figures need matplotlib: pip install 'handtouch[figures]'") from problem
+        raise ImportError("figures need matplotlib: install the extra handtouch[figures]") from problem
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 

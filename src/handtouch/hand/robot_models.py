@@ -31,6 +31,7 @@ from handtouch.hand.joints import FollowerJoint
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.pads import MountUncertainty, mount_transform
 from handtouch.hand.urdf import RobotDescription, UrdfError
+from handtouch.host.installation import extra_command
 
 FloatArray = NDArray[np.float64]
 _MAX_PAD_DEPTH_M, _MAX_PAD_HEIGHT_M = 0.003, 0.010
@@ -40,7 +41,7 @@ _KEYS_REQUIRING_URDF = (
     *("palm_link", "base_link", "joint_names", "joint_prefix"),
     *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
 )
-INSTALL_COMMAND = "pip install 'handtouch[urdf]'"
+INSTALL_COMMAND = extra_command("urdf")
 
 
 class RobotModels:

@@ -26,6 +26,7 @@ from handtouch.client import keys
 from handtouch.config.checks import UDP_MULTICAST_PORT
 from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
+from handtouch.host.installation import extra_command
 from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
 CheckState = Literal["ok", "warn", "fail"]
@@ -259,7 +260,7 @@ def _check_multicast(subject: str, bus: config.Bus) -> HostCheck:
 def _check_serial_device(subject: str, bus: config.Bus) -> Iterator[HostCheck]:
     device = str(bus.channel).split("@")[0]
     if importlib.util.find_spec("serial") is None:
-        yield HostCheck(subject, "fail", f"{bus.interface} needs pyserial", "pip install 'handtouch[slcan]'")
+        yield HostCheck(subject, "fail", f"{bus.interface} needs pyserial", extra_command("slcan"))
     if not Path(device).exists():
         yield HostCheck(subject, "fail", f"no device {device}", "plug the adapter in")
     elif not os.access(device, os.R_OK | os.W_OK):

@@ -20,6 +20,7 @@ from handtouch.client.robot import Robot
 from handtouch.config import Deployment, load
 from handtouch.hand.robot_models import RobotModels
 from handtouch.hand.urdf import read_urdf
+from handtouch.host.installation import extra_command
 
 _QUEUE_MESSAGES = 20_000
 _POLL_S = 0.02
@@ -47,7 +48,7 @@ def run_ros_bridge(options: RosOptions, stop: threading.Event) -> None:
         from handtouch.bridge.ros2.conversion import Stamper
         from handtouch.bridge.ros2.network import RosNetwork, RosNetworkError, ros_name
     except ImportError as error:
-        raise BridgeError(f"DDS is missing ({error}): pip install 'handtouch[ros2]'") from error
+        raise BridgeError(f"DDS is missing ({error}): {extra_command('ros2')}") from error
     deployment, path = load(options.config_path), options.config_path
     _check_names(deployment, ros_name)
     settings, stamper = deployment.daemon, Stamper(options.frame_prefix)

@@ -38,6 +38,8 @@ from handtouch.host.machine import NoRouteError, check_multicast_route
 
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 """Interfaces on which sent frames are received, and counted, again."""
+CABLELESS_INTERFACES = frozenset({"udp_multicast", "virtual"})
+"""python-can's interfaces between programs"""
 _INTERFACES_WITHOUT_BITRATE = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces whose bit rate python-can can't set."""
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.port import CABLELESS_INTERFACES, Port
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.managed_node import ManagedNode
 
@@ -21,7 +21,9 @@ _TOGETHER_HEARTBEATS = 1.5
 _MIN_PAUSE_PART = 0.5
 """Part of a silence that the loop's pause must have to be its cause."""
 _HOST_REMEDY = "reduce the host's load, or run handtouch with real-time priority"
-_BUS_REMEDY = "check this bus's cable, termination, bit rate and adapter"
+_BUS_REMEDY = "check the host's load, then this bus's cable, termination, bit rate and adapter"
+_SIMULATED_REMEDY = "check that the nodes' programs run, and the host's load"
+"""For a bus without cables"""
 
 
 class BusCauses:
@@ -49,7 +51,7 @@ class BusCauses:
         if late and not port.problem:
             return f"as from every pad of bus {port.name}: {late}"
         return self._describe_bus(port, now_ns) or (
-            f"as from every pad of bus {port.name}; {_BUS_REMEDY}" if together else ""
+            f"as from every pad of bus {port.name}; {_remedy(port)}" if together else ""
         )
 
     def of_timeout(self, node: ManagedNode, now_ns: int) -> str:
@@ -67,7 +69,7 @@ class BusCauses:
         if not any(last_ns - frame_ns <= limit_ns for frame_ns in heard):
             return ""
         late = self._describe_pause(now_ns - last_ns, now_ns)
-        return f"as from every node of bus {port.name}" + (f": {late}" if late else f"; {_BUS_REMEDY}")
+        return f"as from every node of bus {port.name}" + (f": {late}" if late else f"; {_remedy(port)}")
 
     def _describe_bus(self, port: Port, now_ns: int) -> str:
         """Describe a problem of the bus, or a missing SYNC."""
@@ -77,7 +79,7 @@ class BusCauses:
         if not self._sync_period_ns or silent_ns <= _MISSED_SYNC_PERIODS * self._sync_period_ns:
             return ""
         since = f" for {silent_ns / 1e6:.0f} ms" if port.last_sync_ns else " yet"
-        return f"no SYNC on bus {port.name}{since}; check its SYNC producer and cable"
+        return f"no SYNC on bus {port.name}{since}; check its SYNC producer"
 
     def _describe_pause(self, silent_ns: int, now_ns: int) -> str:
         """Describe the loop's last pause if it ended within the silence and was a main part of it."""
@@ -85,3 +87,7 @@ class BusCauses:
         if not ended_within or self._pause_ns < _MIN_PAUSE_PART * silent_ns:
             return ""
         return f"the loop was late by {self._pause_ns / 1e6:.0f} ms; {_HOST_REMEDY}"
+
+
+def _remedy(port: Port) -> str:
+    return _SIMULATED_REMEDY if port.bus.interface in CABLELESS_INTERFACES else _BUS_REMEDY

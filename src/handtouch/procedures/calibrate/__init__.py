@@ -15,6 +15,7 @@ from pathlib import Path
 
 from handtouch import config
 from handtouch.core.pad_model import default_calibration_id_of, law_of
+from handtouch.host.installation import extra_command
 from handtouch.procedures.calibrate import plot, report
 from handtouch.procedures.calibrate.daemon_pad import DaemonEndpoints, ServedPad
 from handtouch.procedures.calibrate.fit import fit_law
@@ -171,7 +172,7 @@ class _CalibrationJob:
                 plot.draw(path, self.name, fit, readings, circuits)
                 lines.append(f"wrote {path}")
             except ImportError:
-                lines.append("no plot: it needs matplotlib, pip install 'handtouch[figures]'")
+                lines.append(f"no plot: it needs matplotlib, {extra_command('figures')}")
         return CalibrationResult(made, tuple(lines), "")
 
 

@@ -7,13 +7,14 @@ Public names: `grasp_stimulus` (a grasp as input of a simulated hand), `simulate
 from importlib.util import find_spec
 
 from handtouch import config
+from handtouch.host.installation import extra_command
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.grasp_stimulus import GraspStimulus
 from handtouch.simulate.grasp.patches import contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
 from handtouch.simulate.worlds import DrawnWorld
 
-INSTALL_COMMAND = "pip install 'handtouch[mujoco]'"
+INSTALL_COMMAND = extra_command("mujoco")
 
 __all__ = ["GRASP_OBJECTS", "INSTALL_COMMAND", "GraspRecord", "available", "grasp_stimulus", "simulate_grasp"]
 

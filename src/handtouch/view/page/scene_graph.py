@@ -16,6 +16,7 @@ from handtouch.config import Deployment, HandTable, Pad
 from handtouch.hand import urdf
 from handtouch.hand.pads import mount_transform, pad_surface
 from handtouch.hand.urdf import RobotDescription
+from handtouch.host.installation import extra_command
 from handtouch.view.page.meshes import (
     TriangleMesh,
     body_mesh,
@@ -138,7 +139,7 @@ def _add_robot(
     if missing:
         scene.problems.append(
             f"{hand.name}: {len(missing)} meshes can't be loaded, such as {missing[0]}; put them beside the "
-            "URDF, and pip install 'handtouch[view]'"
+            f"URDF, and {extra_command('view')}"
         )
     return _group_by_digit(
         hand, [scene.add_pad(hand, pad, numbers[pad.mount.link or pad.link]) for pad in hand.pads]
