@@ -5,11 +5,18 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
+
+import pytest
+
+import handtouch
+from handtouch.host.endpoints import LIVE_ENDPOINT
 
 
 def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
@@ -68,6 +75,28 @@ def test_demo_reports_fault_of_scenario_and_leaves_no_files(tmp_path: Path) -> N
     rest = _interrupted_at(r"right/ring_distal.*channel xa", *command, env=home)
     assert re.search(r"^diagnosis: right/ring_distal: channel xa", rest, re.MULTILINE)
     assert not (tmp_path / "state").exists()
+
+
+@pytest.mark.parametrize("occupied", [False, True])
+def test_programs_beside_the_demo_receive_its_contacts(occupied: bool) -> None:
+    with socket.socket() as other:
+        if occupied:
+            with suppress(OSError):  # another program of this machine may have it, with the same effect
+                other.bind(("127.0.0.1", 5580))
+                other.listen()
+        command = [sys.executable, "-m", "handtouch", "demo", "--world", "ideal", "--plain"]
+        demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        with demo:
+            assert demo.stderr is not None
+            told = next(line for line in demo.stderr if "connect to this hand" in line)
+            named = re.search(r"endpoint = (\S+)", told)
+            assert named or not occupied
+            with handtouch.connect("contact/*/*", endpoint=named[1] if named else LIVE_ENDPOINT) as contacts:
+                contact = contacts.recv(60.0)
+            demo.send_signal(signal.SIGINT)
+            demo.stderr.read()
+    assert contact is not None
+    assert contact.hand == "right"
 
 
 def test_ctrl_c_ends_demo_with_summary() -> None:

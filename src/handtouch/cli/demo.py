@@ -1,7 +1,8 @@
 """`handtouch demo`: a simulated hand, the daemon and a live view in one process, on a virtual bus.
 
 With `view` another process shows the hand in the browser. It needs no hardware and doesn't interfere with a
-daemon on the same machine: the bus is python-can's `virtual` interface, and endpoints use free ports.
+daemon on the same machine: the bus is python-can's `virtual` interface, and endpoints are the default ones
+where all of them are free, else free ports.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.table_cache import build_pad_model
+from handtouch.host.endpoints import COMPLETE_ENDPOINT, CONTROL_ENDPOINT, INPUTS_ENDPOINT, LIVE_ENDPOINT
 from handtouch.host.signals import stop_on_signals
 from handtouch.simulate.grasp import grasp_stimulus as grasped
 from handtouch.simulate.scenario import Scenario
@@ -46,6 +48,12 @@ from handtouch.view.page import HOST, PORT
 
 DEFAULT_DEPLOYMENT = "utah_mit.toml"
 DEFAULT_SCENARIO = "utah_mit_session.toml"
+_ENDPOINTS = {
+    "live": LIVE_ENDPOINT,
+    "complete": COMPLETE_ENDPOINT,
+    "control": CONTROL_ENDPOINT,
+    "inputs": INPUTS_ENDPOINT,
+}
 _BOOT_ALLOWANCE_S = 2.0
 _SAMPLE_WINDOW_FRACTION = 0.95  # long, as the nodes share the interpreter
 _GIL_SWITCH_INTERVAL_S = 0.0005
@@ -102,7 +110,9 @@ def run(
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
     try:
         deployment = _with_palm_output(
-            in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
+            _with_default_endpoints(
+                in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
+            )
         )
         hidden = world_with(WORLDS[world], sheet=sheet, drift=drift).draw(seed)
         if scenario_path or hidden.world != WORLDS["ideal"]:
@@ -129,6 +139,7 @@ def run(
             _browser_view(daemon) if view else nullcontext("") as url,
         ):
             collector = _ContactCollector(_choose_display(plain, url), keep=not endless)
+            print(_endpoints_text(daemon.publisher.endpoints["live"]), file=sys.stderr)
             hand.publish_joints(deployment, scenario, daemon.inputs.endpoint)
             hand.start()
             with _daemon_thread(daemon, stop):
@@ -260,11 +271,36 @@ def in_process_deployment(deployment: Deployment) -> Deployment:
         )
         for bus in deployment.buses
     )
-    settings = dict.fromkeys(("live", "complete", "control", "inputs"), "tcp://127.0.0.1:*")
+    settings = dict.fromkeys(_ENDPOINTS, "tcp://127.0.0.1:*")
     # simulated nodes don't belong in the calibration store
     alone = {**settings, "keys": None, "sample_window_fraction": _SAMPLE_WINDOW_FRACTION, "supervise": False}
     daemon = deployment.daemon.model_copy(update=alone)
     return deployment.model_copy(update={"buses": buses, "daemon": daemon})
+
+
+def _with_default_endpoints(deployment: Deployment) -> Deployment:
+    """Return the deployment with the default endpoints, if all of them are free."""
+    if not all(map(_is_free, _ENDPOINTS.values())):
+        return deployment
+    return deployment.model_copy(update={"daemon": deployment.daemon.model_copy(update=_ENDPOINTS)})
+
+
+def _is_free(endpoint: str) -> bool:
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+        except OSError:
+            return False
+    return True
+
+
+def _endpoints_text(live: str) -> str:
+    """Return how programs and commands connect to the demo."""
+    if live == LIVE_ENDPOINT:
+        return "programs and `handtouch watch` connect to this hand by default"
+    return f"the default endpoints are in use: connect to this hand by endpoint = {live}"
 
 
 def _subscribe(daemon: HandtouchDaemon) -> Subscriber[wire.Message]:
