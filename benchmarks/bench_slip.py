@@ -19,6 +19,7 @@ import numpy.typing as npt
 from benchmarks.page import made_by, options, output_folder, progress
 from benchmarks.scores import EventScore, Rate, Share, score_events
 from benchmarks.slip_runs import DEPLOYMENT, Record, pads_of, run
+from handtouch.core.slip import GripModel
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
 
@@ -401,9 +402,9 @@ Sequential test at a stated mean time between false alarms of 600 s. Slips of al
 within {LATEST_S:g} s of the onset; false alarms before the onset. Then a firm grip, from a second after it
 closed; alarms in the second before, while force rises and the tremor isn't learnt yet, are in a column of
 their own. *Bursts*: such grips with chatter of 9 Hz and {BURST_MM:g} mm amplitude, 0.6 s in every 2 s. A slip
-counts once it has moved farther than such chatter does, 0.35 mm or 8 mm/s, also from where it was in the
-0.12 s before its onset, which costs 10 mm/s about 20 ms. Shares in %, rates per hour of a contact, with
-95 % intervals.
+counts once it has moved farther than such chatter does, {1e3 * GripModel().chatter_m:g} mm or 8 mm/s,
+also from where it was in the 0.12 s before its onset, which costs 10 mm/s about 20 ms. Shares in %, rates
+per hour of a contact, with 95 % intervals.
 
 {table([*results["worlds"][0]], worlds)}
 

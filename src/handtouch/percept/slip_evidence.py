@@ -7,7 +7,8 @@ moves with the object. `SLIP_FEATURES` are what is known of each contact over wi
 "Winning the transfer learning track of Yahoo!'s Learning to Rank challenge with YetiRank"), sum the evidence.
 A rigid object slips under several contacts at once, so the odds of slip of a contact are its own sum plus a
 part of the mean of the hand's other contacts.
-benchmarks/train_slip.py trains them with simulated grasps of the tuning family.
+benchmarks/train_slip.py trains them with simulated grasps of the tuning family. That part (OTHERS_WEIGHT) and
+the odds of a hand's only contact (ALONE_LOG_ODDS) were chosen by its cross-validation over seeds.
 
 Public names: `SlipEvidence`, `SlipTrees`, `FEATURE_WINDOW_S`.
 """

@@ -32,36 +32,47 @@ from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis
 from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.wire.faults import FaultKind
 
+# Constants without another origin were tuned by hand on episodes of benchmarks/diagnose_episodes.py with
+# seeds below 1100; none is a counted frequency. docs/benchmarks/diagnose.md and alarms.md measure what they
+# yield.
 SUSPICION_NATS = 20.0
-"""Sum at which a fault is suspected."""
+"""Sum at which a fault is suspected. With an exact model, false suspicions would be e^20 = 5e8 contacts apart
+on average (Lorden 1971), 15 years of a contact a second."""
 MIN_EVIDENCE_NATS = 14.0
-"""Margin of a fault over a pad without one, by joint evidence."""
+"""Margin of a fault over a pad without one, by joint evidence: odds of 1.2e6, for rare faults and what the
+model neglects."""
 _MIN_EVIDENCE_SIMILAR_NATS = 18.0
-"""The same for gain steps and torn corners, whose sizes are free."""
+"""The same for gain steps and torn corners, whose sizes are free: e^4 = 55 more, for the 38 factors of a gain
+and more sizes of cuts that are tried."""
 MIN_SEPARATION_NATS = 6.0
-"""Margin over faults of other kinds; far from the corner, a torn corner looks like a gain step."""
+"""Margin over faults of other kinds, odds of 400; far from the corner, a torn corner looks like a gain
+step."""
 _MIN_SEPARATION_LONG_NATS = 12.0
 """The same between gain steps and torn corners of a long pad, which show in two small currents."""
 CLEAR_NATS = 8.0
-"""Margin of a pad without a fault over the diagnosed one that ends the diagnosis."""
+"""Margin of a pad without a fault over the diagnosed one that ends the diagnosis: odds of 3000, chosen."""
 _MAX_SUM_NATS = 4 * SUSPICION_NATS
 _NATS_PER_LOGIT = 4.0
 """Evidence per logit of the stated confidence: what the model neglects is common to many contacts."""
 _WINDOWS = (64, 52, 44, 36, 28, 20, 12)
-"""Contacts that are explained jointly, and last ones of them among which the fault may have begun."""
+"""Contacts that are explained jointly, and last ones of them among which the fault may have begun. Chosen: 64
+bounds the cost of a joint fit, and a begin between two windows leaves four contacts at most on the wrong
+side."""
 _MIN_CONTACTS_TO_END, _MAX_CONTACTS_TO_END = 20, 40
 """Recent contacts by which a diagnosis ends."""
 _MAX_BEGINS = 3
 """Begins of the most likely suspicions, from which contacts are explained jointly, too."""
 _MIN_CONTACTS, _MAX_STEP_CONTACTS = 6, 6
-"""Contacts before the first comparison, and from one to the next while they find nothing new."""
+"""Contacts before the first comparison, and from one to the next while they find nothing new: chosen, against
+the cost of a comparison."""
 _MAX_SUSPECTS, _MAX_SUSPECTS_ALIKE = 16, 4
 _GAIN_STEP_STD = 0.1
 """Standard deviation of a gain about that of a hypothesis, as factors are few."""
 _CALIBRATED_GAIN_STD = 0.005
 """What temperature and age add to a channel's gain as known."""
 _TOLERANCE_WIDENING = 1.2
-"""Factor on every stated standard deviation: a part far out in its distribution is no fault."""
+"""Factor on every stated standard deviation: a part far out in its distribution is no fault. Chosen: a
+uniform tolerance, such as a gain of +-2 %, ends 1.7 of its standard deviations from its mean."""
 _MIN_UNEXPLAINED_SHARE, _MAX_EXPLAINED_SHARE = 0.65, 0.35
 """Share of contacts that are no points, at which they are unexplained, and at which that ends."""
 _SIMILAR_KINDS = {FaultKind.GAIN_STEP, FaultKind.TORN_CORNER}

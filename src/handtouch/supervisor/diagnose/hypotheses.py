@@ -46,7 +46,7 @@ _LONG_MODEL_ERROR_FRACTION, _LONG_MODEL_ERROR_OF_CURRENT = 5e-4, 0.03
 """Errors of the model on a long pad over the total and over a channel's current, up to the above: far from an
 electrode, its current and the model's error decay alike, and carry the evidence."""
 _NON_POINT_PROBABILITIES = np.array([0.03, 0.5])
-"""Fractions of all contacts that are no points: usually, and while two objects are handled."""
+"""Fractions of all contacts that are no points: usually, and while two objects are handled; chosen."""
 _MIN_LOG_LIKELIHOOD, _MAX_SQUARED_MISFIT = -1e3, 1e6
 _LOG_NON_POINT_SPREAD = np.log(40.0)  # log ratio of the scatter of each score of contacts that are no points
 _CUT_FRACTIONS = (0.2, 0.35, 0.5, 0.65, 0.8, 0.92)
