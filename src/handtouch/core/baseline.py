@@ -27,6 +27,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
 
+# Constants without an origin beside them were chosen; docs/benchmarks/supervise.md measures what they yield.
 BLOCK_DURATION_NS = 97_000_000  # no multiple of a period: rounding of stamps moves no sample to another block
 _MAX_PAUSE_NS = 3600 * 10**9
 _TRACKING_TIME_S = 10.0  # time constant of offsets

@@ -26,6 +26,8 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
 
+# Constants without an origin beside them were chosen; docs/benchmarks/supervise.md and soak_sheets.md
+# measure what they yield.
 UPDATE_PERIOD_S = 0.1
 _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6

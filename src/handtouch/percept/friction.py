@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 from scipy.special import log_ndtr
 
+# Constants without an origin beside them were chosen; docs/benchmarks/shear_slip.md measures what they yield.
 PRIOR_LIMIT, PRIOR_LOG_STD = 0.95, 0.35
 """Limit of friction before anything is known, with the standard deviation of its logarithm: objects differ by
 that, and so do pads."""

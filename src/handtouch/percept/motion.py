@@ -25,6 +25,8 @@ from handtouch.percept.slip_evidence import SlipEvidence
 
 FloatArray = NDArray[np.float64]
 
+# Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they
+# yield.
 _ROLLING_PRIOR = 0.2  # fraction of moving centroids that roll, without joint states
 _MIN_SAMPLES = 4  # samples of a contact before which its motion is undetermined
 _REPORT_PERIOD_NS = 50_000_000

@@ -31,6 +31,8 @@ from handtouch.percept.samples import (
 FloatArray = NDArray[np.float64]
 
 PairDistanceFunction = Callable[[int, float, float], tuple[float, float]]
+# Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they
+# yield.
 SPOT_CLASSES = ("point", "along x", "along y")
 """Classes that one pad's residual distinguishes: only whether the contact is longer along x or along y."""
 

@@ -30,6 +30,8 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.intp]
 BoolArray = npt.NDArray[np.bool_]
 
+# Constants without an origin beside them were chosen; docs/benchmarks/supervise.md and soak_sheets.md
+# measure what they yield.
 _SPEEDS = ((0.0, 1.0), (1.0, 0.2), (1.0, 0.4), (1.0, 0.63), (1.0, 1.0), (1.0, 1.6), (1.0, 3.0))
 """Share and time constant of adaptation over those of the preset."""
 _CREEP_ENDS_S = (40.0, np.inf)

@@ -16,6 +16,7 @@ from handtouch.supervisor.diagnose.features import BlockFeatures
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray
 from handtouch.wire.faults import FaultKind
 
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md measures what they yield.
 ALARM_NATS = 40.0
 """Nats; 15 pads of 200 Hz make 7e9 readings per week: 7e9 e^-40 is one false alarm in 600 million weeks."""
 

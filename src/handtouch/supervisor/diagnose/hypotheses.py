@@ -24,6 +24,8 @@ from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
 from handtouch.wire.faults import FaultKind
 
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and alarms.md measure
+# what they yield.
 _UNKNOWNS = 3
 MIN_CHANNELS = _UNKNOWNS + 1
 """Channels of a pad whose contacts can contradict a hypothesis."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, HandSamples
 
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md measures what they yield.
 MIN_STEPS = 3
 """Openings and closings of an electrode, at least one of each, within `MAX_AGE_NS`."""
 MIN_OPEN_CONTACTS = 6

@@ -17,6 +17,8 @@ from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, Hand
 from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS, StaticLoad
 from handtouch.wire.faults import FaultKind
 
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and diagnose_cases.md
+# measure what they yield.
 CONFIRM_NS = 6_000_000_000
 """Time from a jump to its comparison; longer than the window of the lowest reading."""
 _MIN_STEP_COUNTS, _MIN_STEP_SIGMA = 25.0, 12.0
