@@ -12,6 +12,7 @@ from handtouch.cli.figures import draw_with_progress
 from handtouch.cli.options import add_config, add_json, add_output, integer, positive_number
 from handtouch.cli.progress import ProgressLine
 from handtouch.cli.tables import make_table, output_console
+from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 if TYPE_CHECKING:
@@ -119,7 +120,10 @@ def run(
             result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
             simulated = _simulated(task, result, world, progress) if check else None
             files, no_tables = _write(config_path, task, result, world, out, progress)
-    except (config.ConfigError, ValueError, ImportError) as error:
+    except ImportError as error:
+        print(f"handtouch design: {error}; {extra_command('figures')}", file=sys.stderr)
+        return 2
+    except (config.ConfigError, ValueError) as error:
         print(f"handtouch design: {error}", file=sys.stderr)
         return 2
     except OSError as error:

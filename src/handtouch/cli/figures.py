@@ -9,6 +9,7 @@ from pathlib import Path
 
 from handtouch.cli.options import add_json, add_output
 from handtouch.cli.progress import ProgressLine
+from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 
@@ -40,7 +41,10 @@ def draw_with_progress(command: str, draw: Callable[[Callable[[str], None]], Non
     try:
         with ProgressLine() as progress:
             draw(progress.update)
-    except (ImportError, OSError) as error:
+    except ImportError as error:
+        print(f"handtouch {command}: {error}; {extra_command('figures')}", file=sys.stderr)
+        return 2
+    except OSError as error:
         print(f"handtouch {command}: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ImportError) else 1
+        return 1
     return 0

@@ -40,7 +40,7 @@ def draw_figures(out_dir: Path, on_progress: Callable[[str], None] = lambda _: N
     """Write figure_2.png ... figure_7.png into `out_dir`, created if missing; return their paths.
 
     `on_progress` is called with a description of each figure before it is drawn. Raises
-    ImportError naming the extra where matplotlib isn't installed.
+    ImportError where matplotlib isn't installed.
     """
     out_dir.mkdir(parents=True, exist_ok=True)
     draw: dict[int, Callable[[], Figure]] = {
@@ -65,7 +65,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as problem:
-        raise ImportError("figures need matplotlib: install the extra handtouch[figures]") from problem
+        raise ImportError("figures need matplotlib") from problem
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 
