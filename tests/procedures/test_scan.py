@@ -576,6 +576,34 @@ def test_zero_and_shared_serial_numbers_are_omitted(wire: VirtualBus) -> None:
     assert [pad.serial for pad in made.hands[0].pads] == [None, None, None, None, 6]
 
 
+def test_init_writes_a_deployment_to_start_from(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "hand.toml"
+    assert cli.main(["init", str(file)]) == 0
+    assert f"handtouch demo --config {file} --view" in capsys.readouterr().out
+    assert cli.main(["check", str(file)]) == 1  # for the serial number that it can't know
+    assert re.findall("warning: (.*)", capsys.readouterr().out) == [
+        "hand: no serial for name_me_1: replaced sensors are not detected"
+    ]
+    assert file.read_text().count("# CHECK: ") > 8
+    assert cli.main(["init", str(file)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_init_from_a_scan_has_a_pad_for_every_node(wire: VirtualBus, tmp_path: Path) -> None:
+    started(wire, 2)
+    file = tmp_path / "hand.toml"
+    assert cli.main(["init", "--from-scan", "--bus", wire.option, str(file)]) == 0
+    made = config.load(file)
+    assert [(pad.node_id, pad.serial) for pad in made.hands[0].pads] == [(0x11, 1001), (0x12, 1002)]
+    assert [bus.channel for bus in made.buses] == [wire.channel]
+
+
+def test_init_from_a_scan_without_nodes_writes_nothing(wire: VirtualBus, tmp_path: Path) -> None:
+    file = tmp_path / "hand.toml"
+    assert cli.main(["init", "--from-scan", "--bus", wire.option, str(file)]) == 1
+    assert not file.exists()
+
+
 def test_text_lists_nodes_traffic_and_problems(wire: VirtualBus, capsys: pytest.CaptureFixture[str]) -> None:
     started(wire, 1)
     assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.3"]) == 0

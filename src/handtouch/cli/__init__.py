@@ -27,6 +27,7 @@ COMMANDS = {
     "demo": "run a simulated hand, the daemon and a live view together for half a minute; needs no hardware",
     "run": "run the daemon: read the sensor nodes of a deployment and publish contacts until SIGINT or "
     "SIGTERM",
+    "init": "write a commented deployment file to start from, with the nodes found on a bus or without",
     "simulate": "simulate the sensor nodes of a deployment on its CAN buses",
     "watch": "show the messages of a running daemon in the terminal",
     "view": "serve a live 3D view of a running daemon's hands",

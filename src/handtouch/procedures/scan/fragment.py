@@ -1,6 +1,6 @@
 """Tables of a deployment file that a scan can write: buses, kinds of nodes, and a pad for each node.
 
-Public names: `fragment`, `channel_names`, `FILL_IN`.
+Public names: `fragment`, `starting_deployment`, `channel_names`, `FILL_IN`, `CHECK`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from handtouch import config
 from handtouch.canbus.find.survey import NodeFacts, find_channels_of_node
@@ -16,6 +16,8 @@ from handtouch.config.channels import PROFILE_TYPES, parse_object
 
 FILL_IN = "FILL IN"
 """Mark of lines to be completed by the user; they are comments until then."""
+CHECK = "CHECK"
+"""Mark of values of a starting deployment that are usual ones, not this hand's."""
 
 _DEFAULT_CHANNELS = ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4")
 _NODE_FILL_INS = (
@@ -30,6 +32,8 @@ _PAD_FILL_INS = (
     ("gap_mm = 0.8", "bare length between corner and electrode on each side"),
 )
 
+OpenLines = Callable[[Iterable[tuple[str, str]]], Iterator[str]]
+"""Function that writes lines whose values a scan can't know"""
 FoundNodes = Sequence[tuple[config.Bus, Sequence[NodeFacts]]]
 """Buses, each with the nodes to write."""
 
@@ -43,7 +47,41 @@ def fragment(found: FoundNodes, deployment: config.Deployment | None = None) -> 
     usable = [(bus, [node for node in nodes if channel_names(node)]) for bus, nodes in found]
     if not any(nodes for _, nodes in usable):
         return ""
-    kinds = _NodeKinds(deployment)
+    return "\n".join(_lines(usable, _NodeKinds(deployment, _fill_in_lines), deployment)).rstrip() + "\n"
+
+
+def starting_deployment(found: FoundNodes) -> str:
+    """Return a complete deployment for the nodes, with usual values on the lines marked CHECK.
+
+    Nodes without four channels get analogue inputs 1 to 4 of CiA 401; a bus without nodes gets no pad.
+    """
+    return _BEFORE + "\n".join([*_lines(found, _NodeKinds(None, _check_lines), None)]).rstrip() + "\n"
+
+
+_BEFORE = """\
+# A deployment of handtouch. Lines marked CHECK have usual values: replace them by this hand's. All keys
+# (mounts, for example) are in docs/configuration.md. Then: handtouch check FILE
+# Preview without hardware: handtouch demo --config FILE --view
+
+[daemon]
+sync_period_ms = 10.0 # a sample of every pad, 100 times a second
+
+[sheet.firm]
+ohm_per_square = 2400.0 # CHECK: of the conductive film, between opposite sides of a square of it
+contact_ohm_mm2 = 20_000.0 # CHECK: contact resistance x area at 100 kPa; handtouch calibrate measures it
+alpha = 1.5 # CHECK: exponent of pressure; handtouch calibrate measures it
+contact_radius_mm = 2.5 # CHECK: radius of usual contacts
+contact_radius_std_mm = 0.5 # CHECK: how much it varies (1 sigma)
+max_force_n = 20.0 # CHECK: greatest force expected
+
+[touch]
+begin_threshold_n = 0.06 # a contact begins at this force
+end_threshold_n = 0.03 # and ends below this one
+
+"""
+
+
+def _lines(usable: FoundNodes, kinds: _NodeKinds, deployment: config.Deployment | None) -> Iterator[str]:
     pads = list(_pad_lines(usable, kinds))
     lines: list[str] = []
     for bus, nodes in usable:
@@ -55,7 +93,7 @@ def fragment(found: FoundNodes, deployment: config.Deployment | None = None) -> 
     else:
         hands = ", ".join(hand.name for hand in deployment.hands)
         lines += [f"# Insert below the [[hand]] that the pads belong to: {hands}", ""]
-    return "\n".join([*lines, *pads]).rstrip() + "\n"
+    yield from (*lines, *pads)
 
 
 def channel_names(node: NodeFacts) -> tuple[str, ...]:
@@ -85,8 +123,9 @@ def _addresses(channels: Iterable[str]) -> list[tuple[int, int]]:
 class _NodeKinds:
     """`[node.NAME]` tables: those of the deployment, and new ones for nodes that match none."""
 
-    def __init__(self, deployment: config.Deployment | None) -> None:
+    def __init__(self, deployment: config.Deployment | None, open_lines: OpenLines) -> None:
         self.lines: list[str] = []
+        self.open_lines = open_lines
         self._existing = dict(deployment.nodes) if deployment else {}
         self._added: dict[tuple[object, ...], str] = {}
 
@@ -100,7 +139,7 @@ class _NodeKinds:
         key = (node.vendor_id, node.product_code, channels)
         if key not in self._added:
             self._added[key] = self._new_name(node.name)
-            self.lines += [f"[node.{self._added[key]}]", *_node_lines(node, channels), ""]
+            self.lines += [f"[node.{self._added[key]}]", *_node_lines(node, channels, self.open_lines), ""]
         return self._added[key]
 
     def _new_name(self, device_name: str) -> str:
@@ -120,7 +159,7 @@ def _bus_lines(bus: config.Bus) -> Iterator[str]:
         yield f"options = {{ {options} }}"
 
 
-def _node_lines(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
+def _node_lines(node: NodeFacts, channels: tuple[str, ...], open_lines: OpenLines) -> Iterator[str]:
     if node.name:
         yield f"# {' '.join(part for part in (node.name, node.hardware, node.software) if part)}"
     if node.vendor_id is not None:
@@ -132,8 +171,8 @@ def _node_lines(node: NodeFacts, channels: tuple[str, ...]) -> Iterator[str]:
         remark = "  # i: signed, u: unsigned, f: REAL32/counts per unit; see its manual" if guessed else ""
         yield f"channels = [{', '.join(map(json.dumps, channels))}]{remark}"
     if any(":f32/" in name for name in channels):
-        yield from _fill_in_lines([_REAL32_FILL_IN])
-    yield from _fill_in_lines(_NODE_FILL_INS)
+        yield from open_lines([_REAL32_FILL_IN])
+    yield from open_lines(_NODE_FILL_INS)
 
 
 def _pad_lines(found: FoundNodes, kinds: _NodeKinds) -> Iterator[str]:
@@ -154,10 +193,15 @@ def _pad_lines(found: FoundNodes, kinds: _NodeKinds) -> Iterator[str]:
                 )
                 yield f"# it has {serial}: its replacement can't be detected"
             yield f'node = "{kinds.kind_name(node)}"'
-            yield from _fill_in_lines(_PAD_FILL_INS)
+            yield from kinds.open_lines(_PAD_FILL_INS)
             yield ""
 
 
 def _fill_in_lines(lines: Iterable[tuple[str, str]]) -> Iterator[str]:
     for line, description in lines:
         yield f"# {line}  # {FILL_IN}: {description}"
+
+
+def _check_lines(lines: Iterable[tuple[str, str]]) -> Iterator[str]:
+    for line, description in lines:
+        yield f"{line}  # {CHECK}: {description}"
