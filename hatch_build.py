@@ -21,7 +21,6 @@ class CustomBuildHook(BuildHookInterface):  # type: ignore[type-arg]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and tag the wheel with its platform and the stable ABI of Python 3.11."""
-        del version
         if self.target_name != "wheel":
             return
         source = Path(self.root) / "src"
@@ -32,7 +31,9 @@ class CustomBuildHook(BuildHookInterface):  # type: ignore[type-arg]
         spec.loader.exec_module(build)
         machine = os.environ.get(MACHINE_VARIABLE, "")
         try:
-            files = build.build_stages(source, machine)
+            # a wheel for others depends on the sources alone
+            cache = build.user_cache() if version == "editable" else None
+            files = build.build_stages(source, machine, cache=cache)
         except build.BuildError as error:
             if machine or os.environ.get(REQUIRE_VARIABLE):
                 raise

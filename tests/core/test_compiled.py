@@ -94,7 +94,7 @@ def test_files_of_other_sources_are_removed_even_if_nothing_is_to_compile(copied
 
 
 @needs_compiled
-def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied: Path) -> None:
+def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_clones(copied: Path) -> None:
     folder = copied / "handtouch/core/stages/_compiled"
     files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}
     tables = files["tables"].read_bytes()
@@ -104,13 +104,21 @@ def test_only_changed_modules_are_compiled_and_equal_ones_to_equal_bytes(copied:
     files["tables"].unlink()
     with (copied / "handtouch/core/stages/receive.py").open("a") as file:
         file.write("# edited\n")
-    done = run("-m", "handtouch.core.build", source=copied)
+    cache = copied.parent / "cache"
+    done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache))
     assert done.returncode == 0, done.stderr
     after = {path.name: path.stat().st_ino for path in folder.iterdir()}
     assert len(after) == len(files)
     assert untouched.items() <= after.items()
     assert files["receive"].name not in after
     assert files["tables"].read_bytes() == tables
+    assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
+    reused = list((cache / "handtouch/compiled").iterdir())
+    assert {file.name.partition("-")[0] for file in reused} == {"tables", "receive"}
+    for file in reused:
+        (folder / file.name).unlink()
+    done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache), CC="/bin/false")
+    assert done.returncode == 0, done.stderr
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
 
 

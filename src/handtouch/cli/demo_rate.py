@@ -14,6 +14,7 @@ from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.host.installation import compile_command
 
 _MAX_LOAD = 0.25
 """Part of a period for solving contacts; the simulated hand and the view share the interpreter."""
@@ -36,7 +37,7 @@ def lower_rate(deployment: Deployment, model: PadModel) -> Deployment:
         return deployment
     print(
         f"core uncompiled: SYNC rate lowered from {1e3 / configured_ms:g} to {1e3 / period_ms:g} Hz, "
-        f"which this machine holds; {compilation.reason}",
+        f"which this machine holds: {compilation.reason}; {compilation.remedy or compile_command()}",
         file=sys.stderr,
     )
     settings = deployment.daemon.model_copy(update={"sync_period_ms": period_ms})

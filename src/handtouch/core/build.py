@@ -1,11 +1,12 @@
 """Compile the stages of the core: `python -m handtouch.core.build`.
 
-Public names: `build_stages`, `BuildError`, `MIN_GLIBC`. Needs Cython, a C compiler and Python's headers, and
-nothing else of handtouch, so that a build of the package can use it before that is installed.
+Public names: `build_stages`, `user_cache`, `BuildError`, `MIN_GLIBC`. Needs Cython, a C compiler and Python's
+headers, and nothing else of handtouch, so that a build of the package can use it before that is installed.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import re
@@ -14,12 +15,15 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 
 MIN_GLIBC = (2, 17)
 """Oldest C library that files compiled for other machines run with, as manylinux2014 has it."""
+MAX_CACHED_FILES = 100
+"""Compiled files kept for a user: of six versions, 22 MB"""
 _ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 
 
@@ -27,12 +31,19 @@ class BuildError(Exception):
     """The stages can't be compiled here; says what is missing and which package has it."""
 
 
-def build_stages(source: Path, machine: str = "") -> list[Path]:
+def build_stages(
+    source: Path,
+    machine: str = "",
+    *,
+    cache: Path | None = None,
+    on_progress: Callable[[str], object] = lambda _: None,
+) -> list[Path]:
     """Compile the stages of a source tree's `handtouch` package whose sources changed; return all files.
 
     Files of other sources are removed. Equal sources and compilers give equal bytes, in any folder. With
     `machine`, x86_64 or aarch64, the files are for any Linux on it that has MIN_GLIBC, and are in the folder
-    `build` beside `source`. Raises BuildError.
+    `build` beside `source`. With `cache`, files that were compiled of the same sources before are taken from
+    that folder, and new ones put into it. Raises BuildError.
 
     A machine's own Python.h isn't needed: within the stable ABI, it is the same on all 64-bit Linux.
     """
@@ -42,15 +53,17 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
         files = [source.parent / "build" / machine / file.name for file in files]
     for old in set(files[0].parent.glob("*.so")) - set(files):
         old.unlink()
+    files[0].parent.mkdir(parents=True, exist_ok=True)
     missing = [(name, file) for name, file in zip(compiled.STAGES, files, strict=True) if not file.exists()]
+    missing = [(name, file) for name, file in missing if not _copy(cache, file)]
     if not missing:
         return files
+    on_progress(f"compiling {len(missing)} modules of the core")
     compiler, include = _find_compiler(machine), sysconfig.get_path("include")
     if importlib.util.find_spec("Cython") is None:
         raise BuildError("Cython is missing; pip install cython")
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
-    files[0].parent.mkdir(parents=True, exist_ok=True)
     cython = [sys.executable, "-c", compiled.CYTHON]
     command = [*compiler, *compiled.FLAGS, *compiled.LIMITED_API, f"-I{include}"]
 
@@ -65,6 +78,8 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
             if machine:
                 _check_portable(built, machine)
             built.replace(file)  # never half written where another process loads it
+        on_progress(f"compiled {name}")
+        _keep(cache, file)
 
     compile_stage(missing[0])  # by itself: what fails here would fail for all
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -75,12 +90,59 @@ def build_stages(source: Path, machine: str = "") -> list[Path]:
 def main() -> int:
     """Compile the stages of this installation; return the exit status."""
     try:
-        files = build_stages(Path(__file__).parents[2])
+        files = build_stages(Path(__file__).parents[2], cache=user_cache(), on_progress=_ProgressLine())
     except BuildError as error:
         print(f"handtouch runs uncompiled, some fifty times slower per contact: {error}", file=sys.stderr)
         return 1
     print(f"{len(files)} compiled modules are up to date in {files[0].parent}")
     return 0
+
+
+def user_cache() -> Path:
+    """Return the folder of this user's compiled files, shared by all clones."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "handtouch" / "compiled"
+
+
+class _ProgressLine:
+    """Shows steps on standard error: on one line of a terminal with their number, else the first only."""
+
+    def __init__(self) -> None:
+        self._steps = 0
+
+    def __call__(self, text: str) -> None:
+        if sys.stderr.isatty():
+            print(
+                f"\r\x1b[K  {text} ({self._steps})",
+                end="" if self._steps else "\n",
+                file=sys.stderr,
+                flush=True,
+            )
+        elif not self._steps:
+            print(f"{text} ...", file=sys.stderr, flush=True)
+        self._steps += 1
+
+
+def _copy(cache: Path | None, file: Path) -> bool:
+    """Copy a file of this name from the cache; return False if there is none."""
+    if cache is None or not (cache / file.name).is_file():
+        return False
+    with tempfile.TemporaryDirectory(prefix="copy-", dir=file.parent) as work:
+        copied = shutil.copy(cache / file.name, work)
+        Path(copied).replace(file)
+    return True
+
+
+def _keep(cache: Path | None, file: Path) -> None:
+    """Put a file into the cache, and delete the oldest ones beyond MAX_CACHED_FILES; best effort."""
+    if cache is None:
+        return
+    with contextlib.suppress(OSError):
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="keep-", dir=cache) as work:
+            Path(shutil.copy(file, work)).replace(cache / file.name)
+        for old in sorted(cache.glob("*.so"), key=lambda path: path.stat().st_mtime)[:-MAX_CACHED_FILES]:
+            old.unlink(missing_ok=True)
 
 
 def _load_compiled(source: Path) -> ModuleType:

@@ -22,8 +22,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from handtouch.host.installation import compile_command
-
 STAGES = (
     *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
     *("kinematics", "frames", "publish", "groups", "shear", "evidence"),
@@ -56,22 +54,26 @@ _CIMPORT = re.compile(rf"^from {_PACKAGE}(?:\.(\w+) cimport .*| cimport (.*))$",
 
 
 class Compilation(NamedTuple):
-    """State of the stages in this process: compiled, or the reason why not, with the remedy."""
+    """State of the stages in this process: compiled, or the reason why not.
+
+    `remedy`: where compiling isn't it, else empty.
+    """
 
     compiled: bool
     reason: str
+    remedy: str = ""
 
     @classmethod
     def current(cls) -> Compilation:
         """Return that of this process."""
         if os.environ.get(DISABLE_VARIABLE):
-            return cls(False, f"{DISABLE_VARIABLE} is set; unset it")
+            return cls(False, f"{DISABLE_VARIABLE} is set", "unset it")
         missing = [name for name in STAGES if not compiled_file(name).exists()]
         if not missing:
             return cls(True, "")
         if any((_FOLDER / "_compiled").glob("*.so")):
-            return cls(False, f"the compiled modules are of other sources; {compile_command()}")
-        return cls(False, f"they were never compiled on this machine; {compile_command()}")
+            return cls(False, "the compiled modules are of other sources")
+        return cls(False, "they were never compiled on this machine")
 
 
 @cache

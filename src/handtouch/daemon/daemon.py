@@ -59,6 +59,7 @@ from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
+from handtouch.host.installation import compile_command
 from handtouch.host.process import process_statistics
 
 _log = logging.getLogger("handtouch.daemon")
@@ -224,7 +225,9 @@ class HandtouchDaemon:
         self.master.start(time.monotonic_ns())
         compilation = Compilation.current()
         if not compilation.compiled:
-            _log.warning("core: uncompiled, some fifty times slower per contact: %s", compilation.reason)
+            remedy = compilation.remedy or compile_command()
+            text = "core: uncompiled, some fifty times slower per contact: %s; %s"
+            _log.warning(text, compilation.reason, remedy)
         gc.collect()
         gc.freeze()
         try:

@@ -26,7 +26,7 @@ from handtouch.client import keys
 from handtouch.config.checks import UDP_MULTICAST_PORT
 from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
-from handtouch.host.installation import extra_command
+from handtouch.host.installation import compile_command, extra_command
 from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
 CheckState = Literal["ok", "warn", "fail"]
@@ -118,8 +118,8 @@ def check_core() -> HostCheck:
     state = Compilation.current()
     if state.compiled:
         return HostCheck("core", "ok", "compiled")
-    why, _, remedy = state.reason.partition("; ")
-    return HostCheck("core", "warn", f"uncompiled, some fifty times slower per contact: {why}", remedy)
+    text = f"uncompiled, some fifty times slower per contact: {state.reason}"
+    return HostCheck("core", "warn", text, state.remedy or compile_command())
 
 
 def check_clock(machine: Machine) -> Iterator[HostCheck]:
