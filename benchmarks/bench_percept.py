@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 from benchmarks.page import made_by, options, output_folder
 from handtouch.percept.classify import classify_shape
 from handtouch.percept.pipeline import PerceptPipeline
-from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive
+from handtouch.percept.primitives import SHAPE_CLASSES, fit_primitive, run_to_completion
 from handtouch.percept.primitives import ShapePrior as ShapePrior
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.wire import PERCEPT_KINDS
@@ -145,12 +145,17 @@ def shapes(objects: int) -> dict[str, Any]:
 # Cost -------------------------------------------------------------------------------------------------------
 
 
+def fit_all(name: str, *rows: FloatArray) -> None:
+    """Make all steps of a fit."""
+    run_to_completion(fit_primitive(name, *rows, ShapePrior()))
+
+
 def costs(repeats: int) -> dict[str, float]:
     """Microseconds of a call, median."""
     chance = np.random.default_rng(1)
     contacts = {n: touched("cylinder", n, chance)[:3] for n in (20, 100)}
     return {
-        f"{name}, {n} contacts, all steps": each(partial(fit_primitive, name, *rows, ShapePrior()), repeats)
+        f"{name}, {n} contacts, all steps": each(partial(fit_all, name, *rows), repeats)
         for n, rows in contacts.items()
         for name in SHAPE_CLASSES
     }

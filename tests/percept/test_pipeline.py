@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from handtouch.percept.action_request import CandidateAction, Question
 from handtouch.percept.pipeline import PerceptPipeline
-from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate, PerceptEstimator
 from handtouch.wire import PERCEPT_KINDS
 
 
-class Slow:
+class Slow(PerceptEstimator):
     """A part whose fits are always due."""
 
     # ruff: noqa: ARG002
@@ -20,13 +19,11 @@ class Slow:
     kind = "shape"
 
     def __init__(self) -> None:
-        self.requested = np.zeros(2, dtype=np.bool_)
+        super().__init__(2)
         self.fitted: list[int] = []
         self.stepped = 0
 
-    def process_samples(
-        self, stream: ContactBuffer, sample: ContactSamples, began: NDArray[np.intp]
-    ) -> list[PerceptEstimate]:
+    def process_samples(self, stream: ContactBuffer, sample: ContactSamples) -> list[PerceptEstimate]:
         self.stepped += 1
         assert self.requested[sample.pads].all()
         return []
@@ -36,9 +33,6 @@ class Slow:
 
     def fit_contact(self, stream: ContactBuffer, pad: int, t_ns: int) -> list[PerceptEstimate]:
         self.fitted.append(t_ns)
-        return []
-
-    def end_contacts(self, stream: ContactBuffer, pads: NDArray[np.intp], t_ns: int) -> list[PerceptEstimate]:
         return []
 
     def open_questions(self, t_ns: int) -> list[Question]:

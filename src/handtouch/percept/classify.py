@@ -17,7 +17,7 @@ from handtouch.percept.primitives import (
     SHAPE_CLASSES,
     PrimitiveFit,
     ShapePrior,
-    fit_primitive_stepwise,
+    fit_primitive,
     run_to_completion,
 )
 
@@ -80,7 +80,7 @@ def classify_shape_stepwise(
     for moves in (True,) if moved and enough else (False, True) if enough else (False,):
         one, fits = prior.for_moving_object() if moves else prior, dict[str, PrimitiveFit]()
         for name in classes:
-            fits[name] = yield from fit_primitive_stepwise(name, points_m, normals, covariances_m2, one)
+            fits[name] = yield from fit_primitive(name, points_m, normals, covariances_m2, one)
         found = replace(compare_fits(fits, len(points_m), one), object_moves=moves)
         if result is None or found.state != "invalid":
             result = found

@@ -11,9 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.percept.action_request import Question
 from handtouch.percept.friction import FrictionLimit, FrictionMonitor, FrictionState
-from handtouch.percept.samples import ContactBuffer, ContactSamples, IntArray, PerceptEstimate
+from handtouch.percept.samples import (
+    ContactBuffer,
+    ContactSamples,
+    IntArray,
+    PerceptEstimate,
+    PerceptEstimator,
+)
 
 _EMPTY_NS = 1_000_000_000
 """A hand without contacts for so long grasps another object then."""
@@ -21,7 +26,7 @@ _NO_VECTOR = "no force vector: force_vector_status of contact has the reason"
 _NO_RATIO = "the normal force is less than 1.5 of its standard deviations"
 
 
-class FrictionEstimator:
+class FrictionEstimator(PerceptEstimator):
     """Estimates the friction of the contacts on n pads, those of one hand with one limit.
 
     shear_pads: (n,) pads above shear pads; the others have no friction percept.
@@ -30,19 +35,14 @@ class FrictionEstimator:
     kind = "friction"
 
     def __init__(self, shear_pads: NDArray[np.bool_]) -> None:
-        self.requested = np.zeros(len(shear_pads), dtype=np.bool_)
+        super().__init__(len(shear_pads))
         self._shear_pads = shear_pads.copy()
         self._monitors: dict[int, FrictionMonitor] = {}
         """by hand"""
         self._sample_ns: dict[int, int] = {}
         """last sample of a hand"""
 
-    def process_samples(
-        self,
-        buffer: ContactBuffer,
-        sample: ContactSamples,
-        began: IntArray,  # noqa: ARG002
-    ) -> Sequence[PerceptEstimate]:
+    def process_samples(self, buffer: ContactBuffer, sample: ContactSamples) -> Sequence[PerceptEstimate]:
         """Process a tick's samples of requested pads; return the friction of those above shear pads."""
         found = []
         for k in np.flatnonzero(self._shear_pads[sample.pads]).tolist():
@@ -55,34 +55,11 @@ class FrictionEstimator:
             found.append(self._estimate(monitor, sample, k, hand))
         return found
 
-    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:  # noqa: ARG002
-        """Return None: samples suffice."""
-        return None
-
-    def fit_contact(
-        self,
-        buffer: ContactBuffer,  # noqa: ARG002
-        pad: int,  # noqa: ARG002
-        now_ns: int,  # noqa: ARG002
-    ) -> Sequence[PerceptEstimate]:
-        """Return nothing: no pad needs a fit."""
-        return ()
-
-    def end_contacts(
-        self,
-        buffer: ContactBuffer,
-        pads: IntArray,
-        now_ns: int,  # noqa: ARG002
-    ) -> Sequence[PerceptEstimate]:
+    def end_contacts(self, buffer: ContactBuffer, pads: IntArray) -> None:
         """Forget the contacts that ended."""
         for pad in pads.tolist():
             if monitor := self._monitors.get(int(buffer.hand_index[pad])):
                 monitor.end_contact(pad)
-        return ()
-
-    def open_questions(self, now_ns: int) -> Sequence[Question]:  # noqa: ARG002
-        """Return nothing: actions that load a contact until it slips aren't requested."""
-        return ()
 
     def _estimate(
         self, monitor: FrictionMonitor, sample: ContactSamples, k: int, hand: int

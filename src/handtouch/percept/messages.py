@@ -38,37 +38,29 @@ class PerceptStatus(NamedTuple):
 
 def make_percept_message(percept: PerceptEstimate, hand: str, link: str) -> wire.Percept:
     """Return the message about an estimate; `seq` and `session` are 0."""
-    return wire.Percept(
-        v=wire.SCHEMA_VERSION,
-        session=0,
-        seq=0,
+    return _make_message(
+        percept.kind,
         t_ns=percept.estimate_ns,
         hand=hand,
-        kind=percept.kind,  # type: ignore[arg-type]
         link=link,
         contact_id=percept.contact,
-        state=percept.state,  # type: ignore[arg-type]
+        state=percept.state,
         label=percept.label,
         confidence=percept.probabilities.get(percept.label),
         probabilities=dict(percept.probabilities),
         values=dict(percept.values),
         evidence=dict(percept.evidence),
         reason=percept.reason,
-        retained=False,
-        experimental=percept.kind in wire.EXPERIMENTAL_PERCEPTS,
     )
 
 
 def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.Percept:
     """Return the message about an action request; `seq` and `session` are 0."""
     question, action = request.question, request.action
-    return wire.Percept(
-        v=wire.SCHEMA_VERSION,
-        session=0,
-        seq=0,
+    return _make_message(
+        "action_request",
         t_ns=request.request_ns,
         hand=hand,
-        kind="action_request",
         link=link,
         contact_id=question.contact,
         state="open",
@@ -78,11 +70,15 @@ def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.P
         values={**action.parameters, "expected_information_bits": request.expected_information_bits},
         evidence={},
         reason=request.explanation,
-        retained=False,
         question=question.name,
         expires_ns=request.expires_ns,
-        experimental="action_request" in wire.EXPERIMENTAL_PERCEPTS,
     )
+
+
+def _make_message(kind: Any, **fields: Any) -> wire.Percept:
+    experimental = kind in wire.EXPERIMENTAL_PERCEPTS
+    header = {"v": wire.SCHEMA_VERSION, "session": 0, "seq": 0, "retained": False}
+    return wire.Percept(**header, kind=kind, experimental=experimental, **fields)
 
 
 def pack_message(message: wire.PerceptInput | wire.Percept) -> bytes:

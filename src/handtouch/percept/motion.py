@@ -6,7 +6,7 @@ centroid counts as sliding, with a fixed prior probability of rolling. With join
 and a contact slides, too, whose link moves against the object by more than the joints' deviations explain:
 the object is a rigid body held by the hand's other sticking contacts.
 
-Public names: `MotionReporter`, `slip_probability`.
+Public name: `MotionReporter`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.slip import MOTION_CLASSES, SLIP_SLICES
-from handtouch.percept.relative_motion import RelativeMotion
+from handtouch.percept.relative_motion import RelativeMotion, slip_probability
 from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
 from handtouch.percept.slip_evidence import SlipEvidence
 
@@ -169,11 +169,6 @@ class MotionReporter:
             },
             f"contact has just begun: at least {_MIN_SAMPLES} samples are needed" if few else "",
         )
-
-
-def slip_probability(log_odds: float) -> float:
-    """Return the probability of ln of odds."""
-    return 1 / (1 + math.exp(min(max(-log_odds, -50.0), 50.0)))
 
 
 def _lift_off_probability(force_n: float, rate_n_per_s: float) -> float:

@@ -86,17 +86,17 @@ class PerceptPipeline:
             ended = ended[self.buffer.contact_id[ended] > 0]
             for estimator in self.estimators:
                 if len(rows := ended[estimator.requested[ended]]):
-                    found += estimator.end_contacts(self.buffer, rows, tick_ns)
+                    estimator.end_contacts(self.buffer, rows)
             self.buffer.end_contacts(ended)
         if len(sample.pads):
-            began = self.buffer.add_samples(sample)
+            self.buffer.add_samples(sample)
             for estimator in self.estimators:
-                found += self._process_samples(estimator, sample, began)
+                found += self._process_samples(estimator, sample)
         found += self._fit_next(tick_ns)
         return found, self._select_requests(tick_ns)
 
     def _process_samples(
-        self, estimator: PerceptEstimator, sample: ContactSamples, began: IntArray
+        self, estimator: PerceptEstimator, sample: ContactSamples
     ) -> Sequence[PerceptEstimate]:
         rows = estimator.requested[sample.pads]
         count = np.count_nonzero(rows)
@@ -105,8 +105,8 @@ class PerceptPipeline:
         if count < len(rows):
             some = ContactSamples(sample.pads[rows], sample.sample_ns[rows], sample.contact_id[rows])
             some.values = sample.values[rows]
-            sample, began = some, began[estimator.requested[began]]
-        return estimator.process_samples(self.buffer, sample, began)
+            sample = some
+        return estimator.process_samples(self.buffer, sample)
 
     def _fit_next(self, tick_ns: int) -> Sequence[PerceptEstimate]:
         """Run at most one fit; estimators take turns."""

@@ -6,8 +6,8 @@ MacKay, Information Theory, 2003, ch. 27), which penalises every parameter. The 
 The positions of touches along a surface are taken as given: touches in a row alone are no evidence of an
 edge, only normals that turn about the row are.
 
-Public names: `fit_primitive`, `fit_primitive_stepwise` (the same as a generator), `run_to_completion`,
-`PrimitiveFit`, `ShapePrior`, `SHAPE_CLASSES`, `SIZE_PARAMETERS`.
+Public names: `fit_primitive`, a generator, `run_to_completion`, `PrimitiveFit`, `ShapePrior`,
+`SHAPE_CLASSES`, `SIZE_PARAMETERS`.
 """
 
 from __future__ import annotations
@@ -94,13 +94,6 @@ class PrimitiveFit:
         return float((np.cbrt(self.chi2 / k) - (1 - 2 / (9 * k))) / math.sqrt(2 / (9 * k)))
 
 
-def fit_primitive(
-    name: str, points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray, prior: ShapePrior
-) -> PrimitiveFit:
-    """Fit one class to contacts, arguments as for `classify_shape`."""
-    return run_to_completion(fit_primitive_stepwise(name, points_m, normals, covariances_m2, prior))
-
-
 def run_to_completion(steps: Generator[None, None, T]) -> T:
     """Run a stepwise computation to its end and return its result."""
     while True:
@@ -111,10 +104,13 @@ def run_to_completion(steps: Generator[None, None, T]) -> T:
             return found
 
 
-def fit_primitive_stepwise(
+def fit_primitive(
     name: str, points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray, prior: ShapePrior
 ) -> Generator[None, None, PrimitiveFit]:
-    """Fit as `fit_primitive`, yielding between small steps so that a caller can bound its time."""
+    """Fit one class to contacts, arguments as for `classify_shape`.
+
+    Yields between small steps, so that a caller can bound its time.
+    """
     middle = points_m.mean(axis=0)
     task = _PrimitiveProblem(name, points_m - middle, -normals, covariances_m2, prior)
     found = []

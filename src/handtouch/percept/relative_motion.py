@@ -1,6 +1,6 @@
 """Velocity of a link's surface relative to the object it touches, from joint states and other contacts.
 
-Public name: `RelativeMotion`. `handtouch.core.stages.evidence` computes the velocities.
+Public names: `RelativeMotion`, `slip_probability`. `handtouch.core.stages.evidence` computes the velocities.
 """
 
 from __future__ import annotations
@@ -52,10 +52,11 @@ class RelativeMotion:
             "grasp" if others else "static",
             others,
             # that the object is static is only an assumption
-            _sigmoid((log_ratio if others else max(log_ratio, 0.0)) + _SLIDING_LOG_ODDS),
-            _sigmoid(log_ratio + _SLIDING_AT_REST_LOG_ODDS) if others else 0.0,
+            slip_probability((log_ratio if others else max(log_ratio, 0.0)) + _SLIDING_LOG_ODDS),
+            slip_probability(log_ratio + _SLIDING_AT_REST_LOG_ODDS) if others else 0.0,
         )
 
 
-def _sigmoid(log_odds: float) -> float:
+def slip_probability(log_odds: float) -> float:
+    """Return the probability of ln of odds."""
     return 1 / (1 + math.exp(-max(-50.0, min(50.0, log_odds))))

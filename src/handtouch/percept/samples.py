@@ -1,6 +1,6 @@
 """Buffer of the latest samples of every contact, and the interface of percept estimators.
 
-Public names: `ContactBuffer`, `SampleWindow`, `ContactSamples`, `FIELD_SLICES`, `FitSchedule`,
+Public names: `ContactBuffer`, `ContactSamples`, `FIELD_SLICES`, `FitSchedule`,
 `PerceptEstimate`, `PerceptEstimator`.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,31 +77,6 @@ class ContactSamples:
         self.values[:, FIELD_SLICES[name]] = np.reshape(values, (len(self.pads), -1))
 
 
-class SampleWindow:
-    """Last samples (k,) of one contact, oldest first: `sample_ns`, `relative_s`, and SAMPLE_FIELDS by name.
-
-    The arrays are views of a ring buffer: copy what outlives the tick.
-    """
-
-    def __init__(self, sample_ns: NDArray[np.int64], values: FloatArray) -> None:
-        self.sample_ns, self._values = sample_ns, values
-
-    def __len__(self) -> int:
-        return len(self.sample_ns)
-
-    @property
-    def relative_s(self) -> FloatArray:
-        """Time relative to the last sample [s], zero or negative."""
-        return (
-            np.asarray((self.sample_ns - self.sample_ns[-1]) * 1e-9) if len(self.sample_ns) else np.zeros(0)
-        )
-
-    def __getitem__(self, name: str) -> FloatArray:
-        return np.asarray(
-            self._values[:, FIELD_SLICES[name]].reshape(len(self.sample_ns), *SAMPLE_FIELDS[name])
-        )
-
-
 class ContactBuffer:
     """Ring buffers of the contacts of n pads. Each sample is stored twice, so that every window is
     contiguous.
@@ -124,30 +99,28 @@ class ContactBuffer:
         self.sample_ns = np.zeros((pads, 2 * length), dtype=np.int64)
         self.values = np.full((pads, 2 * length, _WIDTH), np.nan)
 
-    def add_samples(self, sample: ContactSamples) -> IntArray:
-        """Add the samples of a tick; return the pads on which a new contact began."""
+    def add_samples(self, sample: ContactSamples) -> None:
+        """Add the samples of a tick."""
         pads = sample.pads
-        new = self.contact_id[pads] != sample.contact_id
-        began = pads[new]
-        self.sample_count[began] = 0
+        self.sample_count[pads[self.contact_id[pads] != sample.contact_id]] = 0
         self.contact_id[pads] = sample.contact_id
         at = self.sample_count[pads] % self.length
         for where in (at, at + self.length):
             self.sample_ns[pads, where] = sample.sample_ns
             self.values[pads, where] = sample.values
         self.sample_count[pads] += 1
-        return np.asarray(began)
 
     def end_contacts(self, pads: IntArray) -> None:
         """Mark the contacts on these pads as ended."""
         self.contact_id[pads] = 0
         self.sample_count[pads] = 0
 
-    def window(self, pad: int, max_samples: int = SAMPLES_PER_CONTACT) -> SampleWindow:
-        """Return the last samples of the contact on a pad, at most `max_samples`."""
+    def window(self, pad: int, name: str, max_samples: int = SAMPLES_PER_CONTACT) -> FloatArray:
+        """Return a field of the last samples (k, ...) of the contact on a pad, oldest first; a view."""
         k = int(min(max_samples, self.sample_count[pad], self.length))
         stop = int((self.sample_count[pad] - 1) % self.length) + self.length + 1
-        return SampleWindow(self.sample_ns[pad, stop - k : stop], self.values[pad, stop - k : stop])
+        values = self.values[pad, stop - k : stop, FIELD_SLICES[name]]
+        return np.asarray(values.reshape(k, *SAMPLE_FIELDS[name]))
 
     def latest_field(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
         """Return a field of the last sample of each pad (k, ...), or of `back` samples earlier; NaN if
@@ -199,29 +172,33 @@ class PerceptEstimate:
     reason: str = ""
 
 
-class PerceptEstimator(Protocol):
-    """Estimator of one kind of percept over all pads; `requested` (n,) are the pads it runs for.
+class PerceptEstimator:
+    """Base of estimators, each of one kind of percept over n pads; `requested` (n,) are those it runs for.
 
     `process_samples` is called in every tick and must be quick. Slow work belongs in `fit_contact`, which is
     called for one pad now and then and must stay below a few milliseconds.
     """
 
     kind: str
-    requested: NDArray[np.bool_]
 
-    def process_samples(
-        self, buffer: ContactBuffer, sample: ContactSamples, began: IntArray
-    ) -> Sequence[PerceptEstimate]:
+    def __init__(self, pads: int) -> None:
+        self.requested: NDArray[np.bool_] = np.zeros(pads, dtype=np.bool_)
+
+    def process_samples(self, buffer: ContactBuffer, sample: ContactSamples) -> Sequence[PerceptEstimate]:
         """Process a tick's samples of requested pads, already in the buffer; return new estimates."""
+        raise NotImplementedError
 
-    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:
-        """Return the pad most in need of a fit, or None."""
+    def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:  # noqa: ARG002
+        """Return the pad most in need of a fit; None where samples suffice."""
+        return None
 
     def fit_contact(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
         """Fit the contact on one pad, or the object in its hand."""
+        raise NotImplementedError
 
-    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:
-        """Handle the end of contacts on these pads, whose windows still exist; return final estimates."""
+    def end_contacts(self, buffer: ContactBuffer, pads: IntArray) -> None:
+        """Handle the end of contacts on these pads, whose samples are still in the buffer."""
 
-    def open_questions(self, now_ns: int) -> Sequence[Question]:
+    def open_questions(self, now_ns: int) -> Sequence[Question]:  # noqa: ARG002
         """Return the undecided questions with the probabilities so far."""
+        return ()

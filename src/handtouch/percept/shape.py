@@ -9,8 +9,10 @@ Public names: `ShapeEstimator`, `spot_probabilities`, `pair_distance`.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +26,8 @@ from handtouch.percept.samples import (
     ContactBuffer,
     ContactSamples,
     FitSchedule,
-    IntArray,
     PerceptEstimate,
+    PerceptEstimator,
 )
 
 FloatArray = NDArray[np.float64]
@@ -94,32 +96,32 @@ def pair_distance(
     return distance, distance / 2 * residual_std / abs(residual) if determined else math.inf
 
 
+class _TouchedPoint(NamedTuple):
+    """Point of an object, touched by a pad at `sample_ns`, with normal and covariance."""
+
+    pad: int
+    sample_ns: int
+    point: FloatArray
+    normal: FloatArray
+    covariance: FloatArray
+
+
 @dataclass
 class _TouchedObject:
     """Points that a hand touched recently."""
 
-    points: list[FloatArray] = field(default_factory=list)
-    normals: list[FloatArray] = field(default_factory=list)
-    covariances: list[FloatArray] = field(default_factory=list)
-    pads: list[int] = field(default_factory=list)
-    sample_ns: list[int] = field(default_factory=list)
+    points: deque[_TouchedPoint] = field(default_factory=lambda: deque(maxlen=_MAX_POINTS))
     last_touch_ns: int = 0
     has_new_points: bool = False
     running_fit: Generator[None, None, ShapeClassification] | None = None
     classification: ShapeClassification | None = None
 
-    def add_point(
-        self, pad: int, now_ns: int, point: FloatArray, normal: FloatArray, covariance: FloatArray
-    ) -> None:
-        self.points = [*self.points[1 - _MAX_POINTS :], point.copy()]
-        self.normals = [*self.normals[1 - _MAX_POINTS :], normal.copy()]
-        self.covariances = [*self.covariances[1 - _MAX_POINTS :], covariance.copy()]
-        self.pads = [*self.pads[1 - _MAX_POINTS :], pad]
-        self.sample_ns = [*self.sample_ns[1 - _MAX_POINTS :], now_ns]
-        self.has_new_points = True
+    @property
+    def needs_fit(self) -> bool:
+        return self.has_new_points or self.running_fit is not None
 
 
-class ShapeEstimator:
+class ShapeEstimator(PerceptEstimator):
     """Estimates the shape of the object in each hand, and of the contact spot on each pad."""
 
     kind = "shape"
@@ -130,7 +132,7 @@ class ShapeEstimator:
         """pair_m: function of pad, residual and its deviation that returns the distance of two points as
         `pair_distance`, in metres; default: no extent of a spot is reported.
         """
-        self.requested = np.zeros(pads, dtype=np.bool_)
+        super().__init__(pads)
         self.prior = ShapePrior() if prior is None else prior
         self._pair_m = pair_m
         self._objects: dict[int, _TouchedObject] = {}
@@ -138,12 +140,7 @@ class ShapeEstimator:
         self._last_contact_id = np.zeros(pads, dtype=np.uint32)
         self._spot_schedule = FitSchedule(pads, _SPOT_PERIOD_NS)
 
-    def process_samples(
-        self,
-        buffer: ContactBuffer,
-        sample: ContactSamples,
-        began: IntArray,  # noqa: ARG002
-    ) -> Sequence[PerceptEstimate]:
+    def process_samples(self, buffer: ContactBuffer, sample: ContactSamples) -> Sequence[PerceptEstimate]:
         """Store contact points that are new."""
         position, normal, pads = sample["palm_position_m"], sample["palm_normal"], sample.pads
         moved = ((position - self._last_point_m[pads]) ** 2).sum(axis=1) > _MIN_POINT_DISTANCE_M**2
@@ -157,7 +154,9 @@ class ShapeEstimator:
             touched = self._objects.setdefault(int(buffer.hand_index[pad]), _TouchedObject())
             if now_ns - touched.last_touch_ns > _FORGET_TIME_NS and touched.points:
                 touched = self._objects[int(buffer.hand_index[pad])] = _TouchedObject()
-            touched.add_point(pad, now_ns, position[row], normal[row], sample["palm_covariance_m2"][row])
+            rows = position[row], normal[row], sample["palm_covariance_m2"][row]
+            touched.points.append(_TouchedPoint(pad, now_ns, *(values.copy() for values in rows)))
+            touched.has_new_points = True
             self._last_point_m[pad], self._last_normal[pad] = position[row], normal[row]
             self._last_contact_id[pad] = sample.contact_id[row]
         for hand in set(buffer.hand_index[pads].tolist()) & self._objects.keys():
@@ -168,7 +167,7 @@ class ShapeEstimator:
         """Return a pad of a hand with new points or an unfinished fit, else one whose spot is due."""
         for hand, touched in self._objects.items():
             mine = self.requested & (buffer.hand_index == hand)
-            if (touched.has_new_points or touched.running_fit is not None) and mine.any():
+            if touched.needs_fit and mine.any():
                 return int(np.argmax(mine))
         return self._spot_schedule.next_pad(self.requested & (buffer.sample_count >= _MIN_SAMPLES), now_ns)
 
@@ -181,7 +180,7 @@ class ShapeEstimator:
             self._spot_schedule.mark_fitted(pad, now_ns)
             found += self._classify_spot(buffer, pad, now_ns)
         touched = self._objects.get(hand)
-        if touched is None or not (touched.has_new_points or touched.running_fit is not None):
+        if touched is None or not touched.needs_fit:
             return found
         if touched.running_fit is None:
             touched.has_new_points = False
@@ -191,19 +190,17 @@ class ShapeEstimator:
                 next(touched.running_fit)
         except StopIteration as done:
             touched.running_fit, touched.classification = None, done.value
-            found.append(_shape_percept(done.value, hand, now_ns, len(set(touched.pads))))
+            found.append(
+                _shape_percept(done.value, hand, now_ns, len({point.pad for point in touched.points}))
+            )
         return found
-
-    def end_contacts(self, buffer: ContactBuffer, pads: IntArray, now_ns: int) -> Sequence[PerceptEstimate]:  # noqa: ARG002
-        """Return nothing: touched points are kept for a while."""
-        return ()
 
     def open_questions(self, now_ns: int) -> Sequence[Question]:
         """Return a question for each object whose class is undetermined."""
         found = []
         for hand, touched in self._objects.items():
             result = touched.classification
-            here = touched.pads[-1] if touched.pads else -1
+            here = touched.points[-1].pad if touched.points else -1
             if (
                 result is None
                 or result.state != "undetermined"
@@ -216,18 +213,17 @@ class ShapeEstimator:
 
     def _classify_object(self, touched: _TouchedObject) -> Generator[None, None, ShapeClassification]:
         """Classify stepwise; older points get a larger covariance, because objects turn in the hand."""
-        age_s = 1e-9 * (touched.sample_ns[-1] - np.array(touched.sample_ns))
+        _, times_ns, points, normals, covariances = map(np.array, zip(*touched.points, strict=True))
+        age_s = 1e-9 * (times_ns[-1] - times_ns)
         moved_m = np.minimum(_OBJECT_DRIFT_M_PER_S * age_s, _MAX_OBJECT_DRIFT_M)
-        covariances = np.array(touched.covariances) + (moved_m**2)[:, None, None] * np.eye(3)
-        rows = np.array(touched.points), np.array(touched.normals), covariances
+        rows = points, normals, covariances + (moved_m**2)[:, None, None] * np.eye(3)
         moved = (
             touched.classification is not None and touched.classification.object_moves
         )  # once moved, it stays so
         return (yield from classify_shape_stepwise(*rows, self.prior, moved=moved))
 
     def _classify_spot(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
-        window = buffer.window(pad, _SPOT_SAMPLES)
-        residual, std = window["residual"], window["residual_std"]
+        residual, std = (buffer.window(pad, name, _SPOT_SAMPLES) for name in ("residual", "residual_std"))
         known = np.isfinite(residual) & np.isfinite(std)
         hand, contact = int(buffer.hand_index[pad]), int(buffer.contact_id[pad])
         if not known.any():

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.percept.action_request import CandidateAction, Question
-from handtouch.percept.motion import slip_probability
+from handtouch.percept.relative_motion import slip_probability
 from handtouch.percept.samples import ContactBuffer
 
 _MIN_LOG_ODDS = math.log(0.25)  # ln of the odds of slip above which a question is posed
