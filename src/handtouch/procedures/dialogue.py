@@ -1,6 +1,7 @@
 """Prompt and read single keys on a terminal; plain lines when standard input or output is a pipe.
 
-Public names: `Key`, `DialogueCancelled`, `Dialogue`, `open_dialogue`, `TerminalDialogue`, `PlainDialogue`.
+Public names: `Key`, `DialogueCancelled`, `Dialogue`, `open_dialogue`, `TerminalDialogue`, `PlainDialogue`;
+`GuidedProcedure`, the base of procedures with an operator.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import tty
 from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 from rich.console import Console
 from rich.live import Live
@@ -57,6 +58,60 @@ class Dialogue(Protocol):
 
     def read_key(self) -> Key | None:
         """Return the next key without waiting, None if there is none. Raises KeyboardInterrupt on Ctrl-C."""
+
+
+class TimedSample(Protocol):
+    """A sample with its time."""
+
+    @property
+    def sync_ns(self) -> int: ...
+
+
+Sample = TypeVar("Sample", bound=TimedSample)
+
+
+class GuidedProcedure(Generic[Sample]):
+    """A procedure with an operator. Samples, which come without end, carry its time.
+
+    timeout_s: of waiting for the operator. key_at_timeout: taken for an answer that doesn't come.
+    """
+
+    key_at_timeout = Key.QUIT
+
+    def __init__(self, samples: Iterator[Sample], dialogue: Dialogue, timeout_s: float) -> None:
+        self._samples, self._dialogue = samples, dialogue
+        self._timeout_ns = round(timeout_s * 1e9)
+
+    def timed_samples(self) -> Iterator[tuple[Sample, int]]:
+        """Yield the next samples, each with the time since the first of them [ns]."""
+        start_ns: int | None = None
+        for sample in self._samples:
+            start_ns = sample.sync_ns if start_ns is None else start_ns
+            yield sample, sample.sync_ns - start_ns
+
+    def ask_key(self, question: str) -> Key:
+        """Wait for a key; `key_at_timeout` after the time limit, or without keyboard input."""
+        self.print_line(f"  {question}", "ask")
+        for sample, waited_ns in self.timed_samples():
+            self.observe(sample)
+            if (key := self._dialogue.read_key()) is not None:
+                return key
+            if not self._dialogue.accepts_keys or waited_ns > self._timeout_ns:
+                break
+        return self.key_at_timeout
+
+    def observe(self, sample: Sample) -> None:
+        """Process a sample that comes while a key is awaited."""
+
+    def raise_on_key(self) -> None:
+        """Raise DialogueCancelled for any key but Enter."""
+        key = self._dialogue.read_key()
+        if key is not None and key is not Key.ENTER:
+            raise DialogueCancelled(key)
+
+    def print_line(self, text: str, style: str = "") -> None:
+        """Print a line; styles as in `Dialogue`."""
+        self._dialogue.print_line(text, style)
 
 
 @contextlib.contextmanager

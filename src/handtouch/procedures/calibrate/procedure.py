@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch.procedures.calibrate.readings import PadCircuitModel, Weight, WeightReading
-from handtouch.procedures.dialogue import Dialogue, Key
+from handtouch.procedures.dialogue import Dialogue, DialogueCancelled, GuidedProcedure, Key
 
 _SECOND_NS = 1_000_000_000
 _CREEP_DELAY_NS = _SECOND_NS  # after about a second a sheet carries its full current
@@ -57,16 +57,11 @@ class SampledPad(Protocol):
         """Zero the pad; return the reason of a refusal, empty if it was done."""
 
 
-class _WeightKeyPressed(Exception):  # noqa: N818 - no error: a key that ends the current step
-    def __init__(self, key: Key) -> None:
-        self.key = key
-
-
 class _NoReading(Exception):  # noqa: N818
     """No usable reading in time; `str` is the reason."""
 
 
-class WeightProcedure:
+class WeightProcedure(GuidedProcedure[PadSample]):
     """Measures known weights on one pad, in the given order.
 
     timeout_s: of waiting for a weight or a key. `readings`: those so far.
@@ -82,11 +77,10 @@ class WeightProcedure:
         *,
         timeout_s: float = 60.0,
     ) -> None:
+        super().__init__(pad.samples(), dialogue, timeout_s)
         self.readings: list[WeightReading] = []
         self._name, self._weights, self._circuit_model = name, weights, circuit_model
-        self._pad, self._dialogue = pad, dialogue
-        self._timeout_ns = round(timeout_s * 1e9)
-        self._samples = pad.samples()
+        self._pad = pad
 
     def run(self) -> Iterator[WeightReading]:
         """Tare, then yield a reading of every weight; ends early when the operator quits."""
@@ -100,40 +94,40 @@ class WeightProcedure:
                     yield self.readings[-1]
                 else:
                     skipped.add(weight)
-        except _WeightKeyPressed:  # quit; skip and again are handled per weight
-            self._print_line("Quit; the readings so far are kept.")
+        except DialogueCancelled:  # quit; skip and again are handled per weight
+            self.print_line("Quit; the readings so far are kept.")
 
     def confirm(self, question: str) -> bool:
         """Return whether the operator confirms with Enter."""
-        return self._ask_key(question) is Key.ENTER
+        return self.ask_key(question) is Key.ENTER
 
     def _tare_pad(self) -> None:
         while True:
-            self._print_line(f"Don't touch {self._name}: taring ...", "ask")
+            self.print_line(f"Don't touch {self._name}: taring ...", "ask")
             reason = self._pad.tare()
             if not reason:
-                self._print_line("  tared.", "good")
+                self.print_line("  tared.", "good")
                 return
-            self._print_line(f"  not tared: {reason}", "bad")
-            if self._ask_key("Enter or a: repeat, q: quit") not in (Key.ENTER, Key.AGAIN):
-                raise _WeightKeyPressed(Key.QUIT)
+            self.print_line(f"  not tared: {reason}", "bad")
+            if self.ask_key("Enter or a: repeat, q: quit") not in (Key.ENTER, Key.AGAIN):
+                raise DialogueCancelled(Key.QUIT)
 
     def _measure_weight(self, title: str, weight: Weight) -> bool:
-        """Measure a weight once; return False to skip it from now on. Raises _WeightKeyPressed to quit."""
+        """Measure a weight once; return False to skip it from now on. Raises DialogueCancelled to quit."""
         while True:
             try:
                 reading = self._measure_with_retries(title, weight)
             except _NoReading as failed:
-                self._print_line(f"  {failed}.", "bad")
-                key = self._ask_key(f"Enter or a: repeat, s: skip {weight.name}, q: quit")
-            except _WeightKeyPressed as pressed:
+                self.print_line(f"  {failed}.", "bad")
+                key = self.ask_key(f"Enter or a: repeat, s: skip {weight.name}, q: quit")
+            except DialogueCancelled as pressed:
                 key = pressed.key
             else:
                 self.readings.append(reading)
                 self._report_reading(reading)
                 return True
             if key is Key.QUIT:
-                raise _WeightKeyPressed(key)
+                raise DialogueCancelled(key)
             if key is Key.SKIP:
                 return False
 
@@ -141,20 +135,18 @@ class WeightProcedure:
         rejection = ""
         for _ in range(_MAX_ATTEMPTS):
             self._await_unloaded()
-            self._print_line(f"{title} place {weight.name} on the middle of {self._name}", "ask")
+            self.print_line(f"{title} place {weight.name} on the middle of {self._name}", "ask")
             reading, rejection = self._await_reading(weight)
             if not rejection:
                 return reading
-            self._print_line(f"  {rejection}; remove it and place it again.", "bad")
+            self.print_line(f"  {rejection}; remove it and place it again.", "bad")
         raise _NoReading(rejection)
 
     def _await_reading(self, weight: Weight) -> tuple[WeightReading, str]:
-        """Return the settled reading and its problem, if any. Raises _NoReading, _WeightKeyPressed."""
+        """Return the settled reading and its problem, if any. Raises _NoReading, DialogueCancelled."""
         settling = SettlingDetector()
-        started_ns: int | None = None
-        for sample in self._samples:
-            started_ns = started_ns if started_ns is not None else sample.sync_ns
-            self._check_key()
+        for sample, waited_ns in self.timed_samples():
+            self.raise_on_key()
             settled = settling.add_sample(sample)
             self._show_progress(sample, settling)
             if settled is not None:
@@ -164,7 +156,7 @@ class WeightProcedure:
             if since is not None and sample.sync_ns - since > _SETTLING_TIMEOUT_NS:
                 drift = f"{settling.relative_drift:.1%} a second"
                 raise _NoReading(f"the reading doesn't settle ({drift}): is the weight stable?")
-            if since is None and sample.sync_ns - started_ns > self._timeout_ns:
+            if since is None and waited_ns > self._timeout_ns:
                 raise _NoReading(
                     f"{self._name} delivers no samples: is its node connected? See `handtouch status`"
                     if not sample.alive
@@ -173,19 +165,17 @@ class WeightProcedure:
         raise _NoReading("the samples ended")
 
     def _await_unloaded(self) -> None:
-        """Wait until the pad is unloaded. Raises _NoReading, _WeightKeyPressed."""
+        """Wait until the pad is unloaded. Raises _NoReading, DialogueCancelled."""
         unloaded_ns: int | None = None
-        started_ns: int | None = None
-        for sample in self._samples:
-            started_ns = started_ns if started_ns is not None else sample.sync_ns
-            self._check_key()
+        for sample, waited_ns in self.timed_samples():
+            self.raise_on_key()
             if sample.touched or not sample.alive:
                 unloaded_ns = None
             elif unloaded_ns is None:
                 unloaded_ns = sample.sync_ns
             elif sample.sync_ns - unloaded_ns >= _MIN_UNLOADED_NS:
                 return
-            if sample.sync_ns - started_ns > self._timeout_ns:
+            if waited_ns > self._timeout_ns:
                 reason = "is still loaded" if sample.alive else "delivers no samples: see `handtouch status`"
                 raise _NoReading(f"{self._name} {reason}")
 
@@ -195,7 +185,7 @@ class WeightProcedure:
         text = f"  {reading.weight.name}: {1e3 * reading.current_a:.4g} mA at ({x:.1f}, {y:.1f}) mm"
         if len(same) > 1:
             text += f", {len(same)} readings scatter by {np.std(same, ddof=1) / np.mean(same):.1%}"
-        self._print_line(f"{text}; remove it.", "good")
+        self.print_line(f"{text}; remove it.", "good")
 
     def _show_progress(self, sample: PadSample, settling: SettlingDetector) -> None:
         def draw() -> Text:
@@ -207,27 +197,6 @@ class WeightProcedure:
             return text
 
         self._dialogue.show_live(sample.sync_ns, draw)
-
-    def _ask_key(self, question: str) -> Key:
-        """Wait for a key; quit if keys aren't available, or after the timeout."""
-        self._print_line(f"  {question}", "ask")
-        started_ns: int | None = None
-        for sample in self._samples:
-            started_ns = started_ns if started_ns is not None else sample.sync_ns
-            key = self._dialogue.read_key()
-            if key is not None:
-                return key
-            if not self._dialogue.accepts_keys or sample.sync_ns - started_ns > self._timeout_ns:
-                break
-        return Key.QUIT
-
-    def _check_key(self) -> None:
-        key = self._dialogue.read_key()
-        if key is not None and key is not Key.ENTER:
-            raise _WeightKeyPressed(key)
-
-    def _print_line(self, text: str, style: str = "") -> None:
-        self._dialogue.print_line(text, style)
 
 
 class SettlingDetector:

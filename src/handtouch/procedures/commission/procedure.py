@@ -39,7 +39,7 @@ from handtouch.procedures.commission.press import (
     reacting_channels,
 )
 from handtouch.procedures.commission.sample_source import HandSample
-from handtouch.procedures.dialogue import Dialogue, DialogueCancelled, Key
+from handtouch.procedures.dialogue import Dialogue, DialogueCancelled, GuidedProcedure, Key
 
 _NS_PER_S = 1_000_000_000
 _BOOT_TIMEOUT_NS = 10 * _NS_PER_S
@@ -63,13 +63,15 @@ class _PressFailed(Exception):  # noqa: N818
         self.result = result
 
 
-class CommissioningProcedure:
+class CommissioningProcedure(GuidedProcedure[HandSample]):
     """Commissions the pads `selected_rows` of a deployment; `save` is called after each.
 
     `assume_yes`: accept swapped nodes without confirmation. `timeout_s`: time limit for a press or a key.
     `outcomes`: one for every pad of the deployment, in its order. `rest_statistics`: of each slot at rest.
     `assignment`: the slot of each pad.
     """
+
+    key_at_timeout = Key.SKIP
 
     def __init__(
         self,
@@ -82,13 +84,12 @@ class CommissioningProcedure:
         assume_yes: bool = False,
         timeout_s: float = 60.0,
     ) -> None:
+        super().__init__(source.samples(), dialogue, timeout_s)
         self.outcomes = [PadOutcome(hand, pad) for hand, pad in deployment.pads]
         self.rest_statistics: list[RestStatistics] = []
         self._deployment = deployment
-        self._source, self._dialogue, self._save = source, dialogue, save
+        self._source, self._save = source, save
         self.selected_rows, self._assume_yes = selected_rows, assume_yes
-        self._timeout_ns = round(timeout_s * 1e9)
-        self._samples = source.samples()
         self.assignment = NodeAssignment(self.outcomes, lambda: source.nodes)
         kinds = [deployment.nodes[outcome.pad.node] for outcome in self.outcomes]
         self._noise_counts = [kind.noise_counts for kind in kinds]
@@ -116,7 +117,7 @@ class CommissioningProcedure:
             for number, row in enumerate(remaining, 1):
                 self._commission_pad(row, f"[{number}/{len(remaining)}] {self.outcomes[row].name}")
         except DialogueCancelled:  # by q; a and s are handled per pad
-            self._print_line("Stopped; results so far are kept.")
+            self.print_line("Stopped; results so far are kept.")
 
     def node_of(self, row: int) -> NodeStatus:
         """Return the node that a pad is connected to, as far as known."""
@@ -133,23 +134,21 @@ class CommissioningProcedure:
     # Before the first press -------------------------------------------------------------------------------
 
     def _start_nodes(self) -> None:
-        self._print_line("Starting the nodes ...")
-        first_ns: int | None = None
-        for sample in self._samples:
-            first_ns = first_ns if first_ns is not None else sample.sync_ns
+        self.print_line("Starting the nodes ...")
+        for sample, waited_ns in self.timed_samples():
             self._raise_on_quit()
-            if sample.fresh.all() or sample.sync_ns - first_ns > _BOOT_TIMEOUT_NS:
+            if sample.fresh.all() or waited_ns > _BOOT_TIMEOUT_NS:
                 break
         nodes = self._source.nodes
         for node, fresh in zip(nodes, sample.fresh, strict=True):
             if not fresh:
                 state = "no samples" if node.state is NodeState.OPERATIONAL else node.state.name.lower()
-                self._print_line(f"  node 0x{node.node_id:02X} of {node.name}: {state}, {node.reason}", "bad")
-        self._print_line(f"{int(sample.fresh.sum())} of {len(nodes)} nodes respond.")
+                self.print_line(f"  node 0x{node.node_id:02X} of {node.name}: {state}, {node.reason}", "bad")
+        self.print_line(f"{int(sample.fresh.sum())} of {len(nodes)} nodes respond.")
 
     def _measure_rest(self) -> None:
         for attempt in range(_MAX_ATTEMPTS):
-            self._print_line("Touch no pad for a second ...", "ask")
+            self.print_line("Touch no pad for a second ...", "ask")
             self.rest_statistics = self._collect_rest_samples()
             moved = [
                 self.outcomes[slot].name
@@ -159,7 +158,7 @@ class CommissioningProcedure:
             if not moved:
                 break
             if attempt + 1 < _MAX_ATTEMPTS:
-                self._print_line(f"  {', '.join(moved)} changed; trying again.", "bad")
+                self.print_line(f"  {', '.join(moved)} changed; trying again.", "bad")
         baseline = np.zeros((len(self.outcomes), max(self._channels)))
         for row, rest in zip(baseline, self.rest_statistics, strict=True):
             row[: len(rest.mean)] = rest.mean if rest.samples else np.nan
@@ -171,10 +170,10 @@ class CommissioningProcedure:
 
     def _collect_rest_samples(self) -> list[RestStatistics]:
         samples: list[HandSample] = []
-        for sample in self._samples:
+        for sample, waited_ns in self.timed_samples():
             self._raise_on_quit()
             samples.append(sample)
-            if sample.sync_ns - samples[0].sync_ns >= _MIN_REST_NS and len(samples) >= _MIN_REST_SAMPLES:
+            if waited_ns >= _MIN_REST_NS and len(samples) >= _MIN_REST_SAMPLES:
                 break
         counts = np.array([sample.counts for sample in samples], np.float64)
         fresh = np.array([sample.fresh for sample in samples])
@@ -193,8 +192,8 @@ class CommissioningProcedure:
                 presses, order = self._find_electrode_order(row, slot, title)
             except _PressFailed as failed:
                 outcome.result, outcome.problems = failed.result, [str(failed)]
-                self._print_line(f"  {failed}.", "bad")
-                key = self._ask_key("Enter or a: try again, s: skip, q: quit")
+                self.print_line(f"  {failed}.", "bad")
+                key = self.ask_key("Enter or a: try again, s: skip, q: quit")
             except DialogueCancelled as cancelled:
                 key = cancelled.key
             else:
@@ -214,7 +213,7 @@ class CommissioningProcedure:
             press = self._request_press(row, f"{title}: press it anywhere")
             owner = self.assignment.confirmed_owner(press.slot, row)
             if owner is not None:
-                self._print_line(
+                self.print_line(
                     f"  the node of {owner} responded, which is already commissioned. Press the right pad; "
                     f"if you did, repeat {owner} later with --link.",
                     "bad",
@@ -231,7 +230,7 @@ class CommissioningProcedure:
                     f"{needed} electrodes: another pad was pressed, or the nodes are swapped",
                 )
             other = self.outcomes[self.assignment.row_of(press.slot)].name
-            self._print_line(
+            self.print_line(
                 f"  the node of {other} responded ({self._node_text(press.slot)}): the nodes are swapped, or "
                 "another pad was pressed.",
                 "bad",
@@ -299,10 +298,10 @@ class CommissioningProcedure:
         if outcome.electrodes is not None:
             outcome.result = PadResult.AS_CONFIGURED if edit == before else PadResult.CHANGED
         for problem in outcome.problems:
-            self._print_line(f"  {problem}.", "bad")
+            self.print_line(f"  {problem}.", "bad")
         if outcome.electrodes is not None:
             electrodes = ", ".join(outcome.electrodes)
-            self._print_line(
+            self.print_line(
                 f"  {self._node_text(slot)}, electrodes {electrodes}: {outcome.result.value}.", "good"
             )
         self._save(self)
@@ -314,13 +313,13 @@ class CommissioningProcedure:
         self._await_release()
         problem: str | None = None
         for _ in range(_MAX_ATTEMPTS):
-            self._print_line(prompt, "ask")
+            self.print_line(prompt, "ask")
             press = self._await_press(self.assignment.slot_of(row) if expected is None else expected)
             problem = self._press_problem(press, expected)
             if problem is None:
-                self._print_line(f"  detected by {self._node_text(press.slot)}; let go.")
+                self.print_line(f"  detected by {self._node_text(press.slot)}; let go.")
                 return press
-            self._print_line(f"  {problem}; let go, and press again.", "bad")
+            self.print_line(f"  {problem}; let go, and press again.", "bad")
             self._await_release()
         raise _PressFailed(PadResult.AMBIGUOUS, problem or "")
 
@@ -338,17 +337,15 @@ class CommissioningProcedure:
 
     def _await_press(self, slot: int) -> Press:
         name = self.outcomes[slot].name
-        start_ns: int | None = None
-        for sample in self._samples:
-            start_ns = start_ns if start_ns is not None else sample.sync_ns
-            self._raise_on_key()
+        for sample, waited_ns in self.timed_samples():
+            self.raise_on_key()
             press = self._detector.detect_press(sample.sync_ns, sample.counts, sample.fresh)
             strongest = int(np.argmax(self._detector.level_sigma))
             shown = strongest if strongest in self._detector.pressed_slots else slot
             self._show_bars(sample.sync_ns, shown, name if shown == slot else self.outcomes[shown].name)
             if press is not None:
                 return replace(press, counts=press.counts[: self._channels[press.slot]])
-            if sample.sync_ns - start_ns > self._timeout_ns:
+            if waited_ns > self._timeout_ns:
                 break
         raise _PressFailed(PadResult.NO_ANSWER, _NO_ANSWER_TEXT)
 
@@ -356,11 +353,9 @@ class CommissioningProcedure:
         """Wait until nothing is pressed; after the time limit a lasting load becomes the baseline."""
         detector = self._detector
         detector.wait_for_release()
-        start_ns: int | None = None
         warned = False
-        for sample in self._samples:
-            start_ns = start_ns if start_ns is not None else sample.sync_ns
-            self._raise_on_key()
+        for sample, waited_ns in self.timed_samples():
+            self.raise_on_key()
             detector.detect_press(sample.sync_ns, sample.counts, sample.fresh)
             if detector.ready:
                 return
@@ -368,10 +363,9 @@ class CommissioningProcedure:
                 self._show_bars(
                     sample.sync_ns, detector.pressed_slots[0], self.outcomes[detector.pressed_slots[0]].name
                 )
-            waited_ns = sample.sync_ns - start_ns
             if waited_ns > 3 * _NS_PER_S and not warned and detector.pressed_slots:
                 names = ", ".join(self.outcomes[slot].name for slot in detector.pressed_slots)
-                self._print_line(f"  still pressed: {names}; let go.", "bad")
+                self.print_line(f"  still pressed: {names}; let go.", "bad")
                 warned = True
             if waited_ns > self._timeout_ns:
                 detector.reset_baseline()
@@ -411,29 +405,14 @@ class CommissioningProcedure:
 
     # Dialogue ---------------------------------------------------------------------------------------------
 
-    def _ask_key(self, question: str) -> Key:
-        """Wait for a key; SKIP after the time limit, or without keyboard input."""
-        self._print_line(f"  {question}", "ask")
-        start_ns: int | None = None
-        for sample in self._samples:
-            start_ns = start_ns if start_ns is not None else sample.sync_ns
-            self._detector.detect_press(sample.sync_ns, sample.counts, sample.fresh)
-            key = self._dialogue.read_key()
-            if key is not None:
-                return key
-            if not self._dialogue.accepts_keys or sample.sync_ns - start_ns > self._timeout_ns:
-                break
-        return Key.SKIP
+    def observe(self, sample: HandSample) -> None:
+        """Track presses and baselines while a key is awaited."""
+        self._detector.detect_press(sample.sync_ns, sample.counts, sample.fresh)
 
     def _require_enter(self, question: str) -> None:
         """Raise DialogueCancelled for any other key than Enter."""
-        key = self._ask_key(question)
+        key = self.ask_key(question)
         if key is not Key.ENTER:
-            raise DialogueCancelled(key)
-
-    def _raise_on_key(self) -> None:
-        key = self._dialogue.read_key()
-        if key is not None and key is not Key.ENTER:
             raise DialogueCancelled(key)
 
     def _raise_on_quit(self) -> None:
@@ -444,9 +423,6 @@ class CommissioningProcedure:
         self._dialogue.show_live(
             t_ns, lambda: render_channel_bars(slot, name, self._detector, self._channels[slot])
         )
-
-    def _print_line(self, text: str, style: str = "") -> None:
-        self._dialogue.print_line(text, style)
 
 
 def _requested_presses(pad: config.Pad) -> tuple[list[str], list[str]]:
