@@ -25,6 +25,7 @@ from benchmarks.page import made_by, options, output_folder, progress
 from benchmarks.scores import Share
 from handtouch import config
 from handtouch.calibration.store_client import StoreClient
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -170,7 +171,7 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                 if isinstance(word, CalibrationAssessment):
                     trust[word.pad] = word.calibration_state
                 elif isinstance(word, CalibrationUpdate):
-                    model.set_gains_and_law(word.pad, word.gains, word.calibration_id)
+                    model.set_calibration(word.pad, ActiveCalibration(word.calibration_id, word.gains))
                     covariance = np.reshape(word.covariance or (0.0,) * 16, (4, 4))
                     deviation[word.pad] = np.sqrt(np.diag(covariance).max())
             if number in counts:
@@ -179,7 +180,8 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                 words = slow.process_message(block_of(hand, number, model.size), NOW)
         slow.finish(NOW)
     for pad, (hand_name, entry) in enumerate(hand.pads):
-        model.set_gains_and_law(pad, 1 / np.array(world.pad(hand_name, entry).gain_ratio), "true")
+        exact_gains = tuple((1 / np.array(world.pad(hand_name, entry).gain_ratio)).tolist())
+        model.set_calibration(pad, ActiveCalibration("true", exact_gains))
     least = errors_mm(exact, model, readings, places)
     rows = []
     for first, shape in enumerate(SHAPES):

@@ -9,6 +9,7 @@ import numpy as np
 
 from handtouch.calibration.calibration import LawParameters
 from handtouch.config import parse
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slip import SlipDetector
@@ -21,10 +22,9 @@ def main(count: int) -> None:
     rng, model = np.random.default_rng(7), PadModel(parse(TOLERANT_DEPLOYMENT))
     n = model.size
     covariance = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.01))
-    model.set_gains_and_law(
-        1, [1.01, 0.99, 1.0, 1.02], "1-1", LawParameters(20000.0, 1.4, 2400.0, covariance, 2.0)
-    )
-    model.set_uncertainty(1, 1e-4 * np.eye(4), quarantined=False)
+    law = LawParameters(20000.0, 1.4, 2400.0, covariance, 2.0)
+    by_gain = tuple((1e-4 * np.eye(4)).ravel().tolist())
+    model.set_calibration(1, ActiveCalibration("1-1", (1.01, 0.99, 1.0, 1.02), law, by_gain))
     currents, values = np.zeros((n, 4)), np.full((n, VALUE_COUNT), np.nan)
     offset_std = np.full(n, 1e-7)
     solver = make_solver(model, currents, offset_std, np.ones(n, np.bool_), values)

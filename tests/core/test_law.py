@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from handtouch.calibration.calibration import LawParameters
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel, contact_law, law_of
 from tests.procedures.test_calibrate import TRUE, Table, deployed, fitted, weights
@@ -27,7 +28,8 @@ def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_session
     law = contact_law(sheet, law_of(sheet))
     totals_a = [float(law.current(force, 5.0, sheet.ohm_per_square, centre)) for force in FORCES]
     for seed in range(500, 500 + sessions):
-        model.set_gains_and_law(0, np.ones(4), "4711-1", fitted(Table(weights(), seed).readings()).law)
+        law = fitted(Table(weights(), seed).readings()).law
+        model.set_calibration(0, ActiveCalibration("4711-1", law=law))
         solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
         for number, (force_n, total_a) in enumerate(zip(FORCES, totals_a, strict=True)):
             currents[0] = total_a * fractions
@@ -42,7 +44,8 @@ def test_the_std_of_a_force_includes_the_covariance_of_a_calibrated_law(bench: A
     for spread in (0.0, 0.2):
         model = PadModel(bench.deployment)
         covariance = tuple(map(tuple, np.diag([spread**2, 0.0, 0.0]).tolist()))
-        model.set_gains_and_law(0, np.ones(4), "1-1", LawParameters(20000.0, 1.5, 2400.0, covariance))
+        law = LawParameters(20000.0, 1.5, 2400.0, covariance)
+        model.set_calibration(0, ActiveCalibration("1-1", law=law))
         currents = np.zeros((3, 4))
         currents[0] = bench.counts(0, 0.5, 0.5, 1e-3) * model.ampere_per_count[0]
         values = np.full((3, VALUE_COUNT), np.nan)

@@ -16,6 +16,7 @@ from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.core.tick_messages import ContactMessageEncoder
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
+from handtouch.wire.status import MAX_SILENT_PERIODS
 
 ODD = np.array([np.nan, np.inf, -np.inf, 0.0, 1e30, -1e-30, 1.0])
 INTEGERS = np.array([0, 1, 0x7F, 0x80, 0xFF, 0x100, 0xFFFF, 0x10000, 0xFFFFFFFF, 1 << 32, 1 << 62])
@@ -101,7 +102,8 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
         assert contact.uncompensated_force_n is None  # nothing is compensated
         assert contact.position_status == PositionStatus(columns.position_status[pad]).text
         assert contact.force_status == ForceStatus(columns.force_status[pad]).text
-        assert contact.fresh == pipeline.tick.contacts.is_fresh(pad)
+        limit_ns = 0 if state.synchronous[pad] else MAX_SILENT_PERIODS * state.max_sample_period_ns[pad]
+        assert contact.fresh == (state.silent_ns[pad] <= limit_ns)
         requested = bool(state.palm_requested[pad] or state.base_requested[pad])
         assert contact.group == (state.group_id[pad] if requested else 0)
         assert contact.joints_age_s == (finite(state.palm_values[pad, 30]) if requested else None)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.config import parse
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.field import estimate
@@ -162,7 +163,8 @@ def test_covariance_includes_the_uncertainty_of_gains(bench: Any) -> None:
     """Positions of a thousand nodes with random gains scatter as the covariance states."""
     rng = np.random.default_rng(11)
     deviation, model = 0.02, copy.deepcopy(bench.model)
-    model.set_uncertainty(0, deviation**2 * (np.eye(4) - 0.25), quarantined=False)
+    covariance = tuple((deviation**2 * (np.eye(4) - 0.25)).ravel().tolist())
+    model.set_calibration(0, ActiveCalibration("1-1", gain_covariance=covariance))
     contacts = Contacts(model)
     straight = reading(bench, np.full((3, 2), [0.4, 0.65]), 2e-3, None)
     contacts.solve(straight)

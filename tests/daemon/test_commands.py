@@ -17,13 +17,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from handtouch.calibration.calibration import (
-    Calibration,
-    Gains,
     LawParameters,
-    Offsets,
 )
 from handtouch.client import request
 from handtouch.config import ConfigError, Deployment, parse
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.wire import PadState
@@ -277,7 +275,7 @@ def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
         served.tick()
     model = served.pipeline.model
     assert served.pipeline.tick.model is model
-    assert model.calibration_ids[1] == "c1"
+    assert model.calibrations[1].calibration_id == "c1"
     assert (served.pipeline.tick.baseline.expected_counts[1] > 1.0).all()  # it tracks the readings of 0
     assert model.calibration_ids[0] == model.default_calibration_ids[0]
     assert int(served.pipeline.tick.contacts.id[0]) == contact
@@ -312,15 +310,15 @@ def test_contact_law_applies_from_the_next_sample_and_other_parts_stay(served: B
 
 def test_stored_calibration_is_applied_whole_and_an_empty_one_restores_the_file(served: Bench) -> None:
     model = served.pipeline.model
-    nothing, none = ((0.0,) * 3,) * 3, ((0.0,) * 4,) * 4
-    law, gains = LawParameters(1e4, 1.2, 3000.0, nothing), Gains((1.1, 0.9, 1.0, 1.0), none)
+    nothing = ((0.0,) * 3,) * 3
+    law = LawParameters(1e4, 1.2, 3000.0, nothing)
     on_a = model.begin_threshold_a.copy()
-    model.apply_calibration(0, Calibration(gains, Offsets((1.0,) * 4, (0.1,) * 4), law), "7-1")
-    assert (model.law(0), model.calibration_ids[0], model.gains[0, 0]) == (law, "7-1", 1.1)
+    model.set_calibration(0, ActiveCalibration("7-1", (1.1, 0.9, 1.0, 1.0), law))
+    assert (model.law(0), model.gains[0, 0]) == (law, 1.1)
     new_model = PadModel(served.deployment)
     new_model.copy_calibrations(model)
     assert (new_model.law(0), new_model.begin_threshold_a[0]) == (law, model.begin_threshold_a[0])
-    model.apply_calibration(0, Calibration(), "7-2")
+    model.set_calibration(0, model.default_calibration(0))
     assert model.law(0).ohm_per_square == 2400.0
     assert model.begin_threshold_a == pytest.approx(on_a)
 

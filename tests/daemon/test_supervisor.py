@@ -166,7 +166,7 @@ def test_calibration_is_applied_whole(rig: Rig) -> None:
     rig.receive(calibrate(1, 12, offset_counts=(3.0, 4.0, 5.0, 6.0), offset_std=(0.5,) * 4))
     model = rig.pipeline.model
     assert model.gains[1].tolist() == [1.1, 1.0, 1.0, 0.9]
-    assert model.calibration_ids[1] == "12-1"
+    assert model.calibrations[1].calibration_id == "12-1"
     assert np.diag(model.gain_covariance[1]).tolist() == [1e-4] * 4
     assert rig.pipeline.tick.baseline.expected_counts[1].tolist() == [3.0, 4.0, 5.0, 6.0]
     assert rig.supervisor.changed_pads >= {1}
@@ -185,7 +185,7 @@ def test_manual_calibration_is_sent_until_a_better_one_is_estimated(rig: Rig) ->
     assert np.diag(rig.pipeline.model.gain_covariance[1]) == pytest.approx([0.01**2 * 0.75] * 4)
     rig.swap(0, 11, 11)  # as after a restart of the process, which applies stored calibrations first
     rig.receive(calibrate(1, 12), update)
-    assert (len(sent()), rig.pipeline.model.calibration_ids[1]) == (2, "bench-1")
+    assert (len(sent()), rig.pipeline.model.calibrations[1].calibration_id) == (2, "bench-1")
     rig.receive(calibrate(1, 12))  # estimated from contacts
     rig.swap(0, 11, 11)
     assert len(sent()) == 2

@@ -25,6 +25,7 @@ from rich.text import Text
 from handtouch import cli, client, config
 from handtouch.calibration.calibration import CalibrationVersion
 from handtouch.calibration.store import Store
+from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel, default_calibration_id_of, law_of
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.device import DeviceBus
@@ -487,7 +488,7 @@ def test_a_law_of_a_growing_radius_is_stored_and_applied(
     assert law.hertz_force_n == pytest.approx(IN_THE_MIDDLE_N)
     model = PadModel(deployed())
     before_a = model.end_threshold_a[0]
-    model.apply_calibration(0, version.calibration, version.calibration_id)
+    model.set_calibration(0, ActiveCalibration(version.calibration_id, law=law))
     light_a = min(reading.current_a for reading in readings)  # of 10 gf, four times the threshold
     assert 0.1 * light_a < model.end_threshold_a[0] < 0.4 * light_a
     assert model.end_threshold_a[0] > 1.5 * before_a

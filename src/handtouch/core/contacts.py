@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.detect import ContactDetection
 from handtouch.core.state import TickState
-from handtouch.wire.status import MAX_SILENT_PERIODS
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
@@ -84,12 +83,6 @@ class ContactDetector:
         arrays["excess"] = view_memory(np.zeros(self._state.channels))
         arrays["offset_std_a"] = view_memory(self.offset_std_a)
         self.stage = ContactDetection(self._state.pads, self._state.memory | arrays, view_memory(self._rows))
-
-    def is_fresh(self, pad: int) -> bool:
-        """Return True if the pad sent its last expected sample."""
-        held = self._state
-        limit_ns = 0 if held.synchronous[pad] else MAX_SILENT_PERIODS * held.max_sample_period_ns[pad]
-        return bool(held.silent_ns[pad] <= limit_ns)
 
     @property
     def begun_count(self) -> int:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.calibration.calibration import Calibration, LawParameters, LearnedParts, matrix
+from handtouch.calibration.calibration import LawParameters, LearnedParts, matrix
 from handtouch.config import Deployment
 from handtouch.config.channels import (
     Channels,
@@ -59,8 +59,8 @@ _LOCAL_UNEVENNESS = 1.5  # standard deviation of ln of the local sheet resistanc
 class PadModel:
     """Columns of the n pads of a deployment, in its order, which is also the slab's.
 
-    `hands`, `links`, `frame_links` (URDF links) and `calibration_ids` (n,) are names; `rows_of_hand`: hand ->
-    slice of rows; `calibrations` (n,): the active ones. `electrodes`: names of each pad's, `electrode_counts`
+    `hands`, `links` and `frame_links` (URDF links) (n,) are names; `rows_of_hand`: hand -> slice of rows;
+    `calibrations` (n,): the active ones. `electrodes`: names of each pad's, `electrode_counts`
     (n,) their numbers; `c`, `channels`, is the largest of them. Columns beyond a pad's own are 0.
     `slab_channels` and `slab_columns` (n,): those of the slab, electrodes before those of shear pads, which
     `shear_pads` describe.
@@ -188,14 +188,6 @@ class PadModel:
         """Return the calibration of a pad without one: the deployment's."""
         return ActiveCalibration(self.default_calibration_ids[pad], (1.0,) * int(self.electrode_counts[pad]))
 
-    def apply_calibration(self, pad: int, calibration: Calibration, name: str) -> None:
-        """Apply gains and contact law of a pad's calibration; its offsets are applied to the baseline.
-
-        Parts that the calibration lacks are the deployment's.
-        """
-        gains = calibration.gains.factors if calibration.gains else self.default_calibration(pad).gains
-        self.set_gains_and_law(pad, gains, name, calibration.law)
-
     def set_calibration(self, pad: int, calibration: ActiveCalibration) -> None:
         """Apply a calibration as a whole. Where series resistors matter, contacts are located with the
         deployment's sheet resistance."""
@@ -235,18 +227,6 @@ class PadModel:
         else:
             self.forward_tables[pad] = table.with_dead_electrode(network, electrode)
 
-    def set_gains_and_law(
-        self, pad: int, gains: ArrayLike, calibration_id: str, law: LawParameters | None = None
-    ) -> None:
-        """Set the gains of the channels of a pad, its contact law and calibration id.
-
-        `law` None: the deployment's.
-        """
-        values = tuple(np.asarray(gains, np.float64).tolist())
-        self.set_calibration(
-            pad, replace(self.calibrations[pad], calibration_id=calibration_id, gains=values, law=law)
-        )
-
     def _set_parts(self, pad: int, parts: LearnedParts | None) -> None:
         """Apply what is known of the parts of a pad, None: as the deployment states, and of its gains."""
         count = int(self.electrode_counts[pad])
@@ -260,11 +240,6 @@ class PadModel:
             axes[:count, :count] = _triangle(self.gain_covariance[pad, :count, :count])
         self.part_axes[pad, : size * size] = axes.ravel()
         self.part_axis_ends[pad, :size] = ((axes != 0) * np.arange(1, size + 1)).max(axis=1)
-
-    @property
-    def calibration_ids(self) -> list[str]:
-        """Names of the calibrations (n,)."""
-        return [calibration.calibration_id for calibration in self.calibrations]
 
     @property
     def begin_threshold_counts(self) -> FloatArray:
@@ -283,33 +258,6 @@ class PadModel:
     def default_law(self, pad: int) -> LawParameters:
         """Return the contact law of the deployment."""
         return self._file_laws[pad]
-
-    def set_uncertainty(
-        self,
-        pad: int,
-        log_gain_covariance: ArrayLike | None,
-        quarantined: bool,
-        position_unreliable: bool = False,
-        diagnoses: tuple[str, ...] = (),
-    ) -> None:
-        """Set the covariance (k, k) of a pad's k log gains, None: as the deployment states.
-
-        `quarantined`: publish no force; `position_unreliable`: publish positions as unreliable; because of
-        `diagnoses`.
-        """
-        covariance = None
-        if log_gain_covariance is not None:
-            covariance = tuple(np.ravel(np.asarray(log_gain_covariance, np.float64)).tolist())
-        self.set_calibration(
-            pad,
-            replace(
-                self.calibrations[pad],
-                gain_covariance=covariance,
-                quarantined=quarantined,
-                position_unreliable=position_unreliable,
-                diagnoses=diagnoses,
-            ),
-        )
 
     def copy_calibrations(self, other: PadModel) -> None:
         """Take over all calibrations of the model that this one replaces."""

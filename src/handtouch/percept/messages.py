@@ -77,7 +77,7 @@ def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.P
 
 def _make_message(kind: Any, **fields: Any) -> wire.Percept:
     experimental = kind in wire.EXPERIMENTAL_PERCEPTS
-    header = {"v": wire.SCHEMA_VERSION, "session": 0, "seq": 0, "retained": False}
+    header: dict[str, Any] = {"v": wire.SCHEMA_VERSION, "session": 0, "seq": 0, "retained": False}
     return wire.Percept(**header, kind=kind, experimental=experimental, **fields)
 
 
