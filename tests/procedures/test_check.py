@@ -61,6 +61,16 @@ def test_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
     assert [pad["link"] for pad in report["hands"][0]["pads"]][:2] == ["thumb_proximal", "thumb_middle"]
 
 
+def test_sizes_are_those_as_built(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "hand.toml"
+    surface = 'surface = { kind = "plane", length_mm = 48.0, width_mm = 16.0, resistivity_ratio = 1.5 }'
+    text = TEXT.replace('surface = { kind = "plane", length_mm = 36.0, width_mm = 56.0 }', surface)
+    assert text != TEXT
+    path.write_text(text)
+    check_command.run(path, as_json=False, schema=False)
+    assert " 48.0 x  16.0 mm" in capsys.readouterr().out
+
+
 def test_invalid_file_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("drive_v", "drive"))

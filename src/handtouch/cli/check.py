@@ -78,11 +78,11 @@ def _print_summary(path: Path, facts: dict[str, Any], warnings: list[str]) -> No
     for hand in facts["hands"]:
         print(f"  hand {hand['name']}: {len(hand['pads'])} pads")
         for pad in hand["pads"]:
-            a, b = pad["rectangle_mm"]
+            length_mm, width_mm = pad["size_mm"]
             serial = "no serial" if pad["serial"] is None else f"serial {pad['serial']}"
             print(
                 f"    {pad['link']:<16} {pad['bus']} node 0x{pad['node_id']:02X}  {pad['surface']:<8} "
-                f"{a:5.1f} x {b:5.1f} mm  {_measured(pad)}  {serial}"
+                f"{length_mm:5.1f} x {width_mm:5.1f} mm  {_measured(pad)}  {serial}"
             )
         if limited := [pad for pad in hand["pads"] if pad["measured_force_n"] is not None]:
             needed_ma = max(pad["needed_full_scale_ma"] for pad in limited)

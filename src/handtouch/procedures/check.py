@@ -191,6 +191,7 @@ def _burst_ms(deployment: config.Deployment, bus: config.Bus) -> float:
 
 def _pad_summary(pad: config.Pad, deployment: config.Deployment) -> dict[str, Any]:
     a, b = pad.surface.rectangle_mm
+    length_m, width_m = pad.surface.build().extent_m
     sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
     force_n, force_at, needed_ma = _range(pad, node, sheet)
     return {
@@ -199,6 +200,7 @@ def _pad_summary(pad: config.Pad, deployment: config.Deployment) -> dict[str, An
         "node_id": pad.node_id,
         "serial": pad.serial,
         "surface": pad.surface.kind,
+        "size_mm": [round(1e3 * length_m, 2), round(1e3 * width_m, 2)],
         "rectangle_mm": [round(a, 2), round(b, 2)],
         "aspect": round(max(a / b, b / a), 3),
         "measured_force_n": None if math.isinf(force_n) else round(force_n, 2),
