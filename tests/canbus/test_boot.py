@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
 from handtouch.canbus.nodes.boot import (
-    ExpectedIdentity,
-    Identity,
-    IdleSettings,
     check_identity,
     check_settings,
     configure_node,
     read_identity,
 )
+from handtouch.canbus.nodes.spec import Identity, NodeSpec
 from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping, read_mapping
 from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
 from handtouch.config.channels import (
     STANDARD_CHANNELS,
     Channel,
     Channels,
-    WritableObject,
 )
 from handtouch.core.slab import STANDARD_LAYOUT, ChannelField
 
@@ -81,12 +78,9 @@ def tpdo(
     return {(0x1A00 + number - 1, 0): (len(entries), 1)} | mapping | communication
 
 
-@dataclass
-class Settings:
-    heartbeat_ms: int
-    idle: IdleSettings | None = None
-    excitation: WritableObject | None = None
-    event_timer_ms: int = 5
+def spec(**changes: Any) -> NodeSpec:
+    """Return what the deployment states of the node."""
+    return NodeSpec(0, "can0", 5, "hand/pad", **changes)
 
 
 def found(enabled: bool = True, transmission: int = 1) -> NodeTpdo:
@@ -100,7 +94,7 @@ def identity(*values: int) -> dict[tuple[int, int], tuple[int, int]]:
 def test_all_parts_of_the_identity_are_read() -> None:
     found = read_identity(Node(identity(1, 2, 3, 4)).sdo)
     assert found == Identity(1, 2, 3, 4)
-    check_identity(found, ExpectedIdentity(1, 2, 3, 4))
+    check_identity(found, spec(vendor_id=1, product_code=2, revision=3, serial=4))
 
 
 def test_only_the_vendor_id_is_mandatory() -> None:
@@ -109,7 +103,7 @@ def test_only_the_vendor_id_is_mandatory() -> None:
 
 def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> None:
     with pytest.raises(BootStepError, match=r"serial number is none, as 0x1018:04 .* is 4") as caught:
-        check_identity(Identity(1, 2, 3), ExpectedIdentity(serial=4))
+        check_identity(Identity(1, 2, 3), spec(serial=4))
     assert caught.value.wrong_device
 
 
@@ -117,15 +111,13 @@ def test_node_without_serial_number_is_not_the_one_with_the_configured_one() -> 
 def test_node_of_another_pad_is_refused_and_named(configured: int | None) -> None:
     """Also without a configured serial number, as where nodes may be replaced."""
     others = {4: "h/thumb on can0", 5: "h/index on can1"}
-    check_identity(Identity(1, 2, 3, 6), ExpectedIdentity(serial=configured, serials_of_other_pads=others))
+    check_identity(Identity(1, 2, 3, 6), spec(serial=configured, serials_of_other_pads=others))
     with pytest.raises(
         BootStepError, match=r"is 5 \(0x5\), which is configured for h/index on can1; .*swapped"
     ) as caught:
-        check_identity(
-            Identity(1, 2, 3, 5), ExpectedIdentity(serial=configured, serials_of_other_pads=others)
-        )
+        check_identity(Identity(1, 2, 3, 5), spec(serial=configured, serials_of_other_pads=others))
     assert caught.value.wrong_device
-    expected = ExpectedIdentity(vendor_id=8, serial=configured, serials_of_other_pads=others)
+    expected = spec(vendor_id=8, serial=configured, serials_of_other_pads=others)
     with pytest.raises(BootStepError, match="vendor id is 1"):  # makers number their nodes alike
         check_identity(Identity(1, 2, 3, 5), expected)
 
@@ -241,7 +233,7 @@ def test_only_differences_are_written_and_only_pdo_changes_need_pre_operational(
     node = Node(tpdo(2, CHANNELS, cob_id, found.transmission_type) | {(0x1017, 0): (heartbeat, 2)})
     halted: list[bool] = []
     made = configure_node(
-        node.sdo, PdoMapping((found,), STANDARD_LAYOUT), Settings(100), lambda: halted.append(True)
+        node.sdo, PdoMapping((found,), STANDARD_LAYOUT), spec(heartbeat_ms=100), lambda: halted.append(True)
     )
     assert not made.guarded
     assert (node.writes, len(halted)) == (writes, halts)
@@ -250,14 +242,14 @@ def test_only_differences_are_written_and_only_pdo_changes_need_pre_operational(
 def test_node_without_heartbeat_gets_it_as_guard_time() -> None:
     node = Node(tpdo(2, CHANNELS, 0x285) | {(0x100C, 0): (0, 2), (0x100D, 0): (0, 1)})
     assert configure_node(
-        node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(150), lambda: None
+        node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), spec(heartbeat_ms=150), lambda: None
     ).guarded
     assert node.writes == [(0x100C, 0, 150), (0x100D, 0, 30)]
 
 
 def test_node_without_heartbeat_and_guard_time_is_guarded_all_the_same() -> None:
     assert configure_node(
-        Node({}).sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(150), lambda: None
+        Node({}).sdo, PdoMapping((found(),), STANDARD_LAYOUT), spec(heartbeat_ms=150), lambda: None
     ).guarded
 
 
@@ -274,7 +266,10 @@ def test_transmission_type_of_a_strict_node_is_changed_with_its_pdo_disabled() -
 
     node.intercept(strict)
     configure_node(
-        node.sdo, PdoMapping((found(transmission=255),), STANDARD_LAYOUT), Settings(100), lambda: None
+        node.sdo,
+        PdoMapping((found(transmission=255),), STANDARD_LAYOUT),
+        spec(heartbeat_ms=100),
+        lambda: None,
     )
     assert node.writes == [(0x1801, 1, 0x80000285), (0x1801, 2, 1), (0x1801, 1, 0x285)]
 
@@ -283,7 +278,9 @@ def test_value_that_is_not_kept_is_an_error() -> None:
     node = Node({(0x1017, 0): (0, 2)})
     node.forgets.add(0x1017)
     with pytest.raises(BootStepError, match="heartbeat time, 0x1017:00, was set to 100 but reads 0"):
-        configure_node(node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), Settings(100), lambda: None)
+        configure_node(
+            node.sdo, PdoMapping((found(),), STANDARD_LAYOUT), spec(heartbeat_ms=100), lambda: None
+        )
 
 
 def test_timeout_and_refusal_are_distinguished() -> None:
@@ -407,7 +404,7 @@ def test_a_schedule_is_written_to_the_tpdos_of_its_states_while_they_are_disable
         tpdos.append(NodeTpdo(number, cob_id, True, 1, ()))
     node = Node(objects)
     mapping = PdoMapping(tuple(tpdos), STANDARD_LAYOUT, (0, 1))
-    configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2)
+    configure_node(node.sdo, mapping, spec(heartbeat_ms=100, sync_overflow=2), lambda: None)
     assert node.objects[0x1019, 0][0] == 2
     for number, state in ((2, 0), (3, 1)):
         index = 0x1800 + number - 1
@@ -426,13 +423,15 @@ def test_a_node_that_does_not_count_syncs_has_no_schedule() -> None:
     node = Node({(0x1017, 0): (100, 2)})
     mapping = PdoMapping((found(),), STANDARD_LAYOUT, (0,))
     with pytest.raises(BootStepError, match="no 0x1019, SYNC counter overflow"):
-        configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2)
+        configure_node(node.sdo, mapping, spec(heartbeat_ms=100, sync_overflow=2), lambda: None)
 
 
 def test_others_on_the_bus_of_a_schedule_may_lack_the_counter() -> None:
     node = Node({(0x1017, 0): (100, 2)})
     mapping = PdoMapping((found(),), STANDARD_LAYOUT)
-    assert not configure_node(node.sdo, mapping, Settings(100), lambda: None, sync_overflow=2).refusal
+    assert not configure_node(
+        node.sdo, mapping, spec(heartbeat_ms=100, sync_overflow=2), lambda: None
+    ).refusal
 
 
 @pytest.mark.parametrize("refuses", [False, True])

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.canbus.nodes.boot import IdleSettings
 from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.spec import IdleSettings
 from handtouch.config import shipped
 from handtouch.config.channels import WritableObject, parse_writable_object, resolve_channels
 

@@ -6,8 +6,7 @@ import re
 
 import pytest
 
-from handtouch.canbus.nodes.boot import IdleSettings
-from handtouch.canbus.nodes.spec import NodeSpec, check_nodes, node_specs
+from handtouch.canbus.nodes.spec import IdleSettings, NodeSpec, check_nodes, node_specs
 from handtouch.config import (
     ConfigError,
     Deployment,

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from handtouch.canbus.nodes.boot import IdleSettings
 from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.spec import IdleSettings
 from handtouch.config import shipped
 from handtouch.config.channels import WritableObject, parse_writable_object
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch import cli, config
-from handtouch.canbus.nodes.boot import Identity
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.spec import NodeStatus
+from handtouch.canbus.nodes.spec import Identity, NodeStatus
 from handtouch.cli import commission as commission_command
 from handtouch.cli.commission import format_table
 from handtouch.config import shipped

@@ -24,7 +24,6 @@ from handtouch.procedures.conformance import (
     BusInUseError,
     ConformanceOptions,
     NodeReport,
-    Operator,
     PortLine,
     Targets,
     Verdict,
@@ -35,7 +34,7 @@ from handtouch.procedures.conformance import (
     run_checks,
     select_targets,
 )
-from handtouch.procedures.dialogue import Dialogue, Key, open_dialogue
+from handtouch.procedures.dialogue import Dialogue, open_dialogue
 
 _STYLES = {Verdict.PASSED: "green", Verdict.FAILED: "red", Verdict.NOT_TESTED: "dim"}
 _NAME_WIDTH = 24
@@ -213,7 +212,7 @@ def _test_all(targets: Targets, options: ConformanceOptions, interactive: bool) 
     with ExitStack() as stack:
         if interactive:
             dialogue = stack.enter_context(open_dialogue())
-            return _test_buses(targets, options, _live_progress(dialogue), DialogueOperator(dialogue))
+            return _test_buses(targets, options, _live_progress(dialogue), dialogue)
         console = Console(stderr=True)
         if not console.is_terminal:
             return _test_buses(targets, options, lambda _: None, None)
@@ -222,7 +221,7 @@ def _test_all(targets: Targets, options: ConformanceOptions, interactive: bool) 
 
 
 def _test_buses(
-    targets: Targets, options: ConformanceOptions, progress: Progress, operator: Operator | None
+    targets: Targets, options: ConformanceOptions, progress: Progress, operator: Dialogue | None
 ) -> list[NodeReport]:
     reports = []
     for bus in targets.buses:
@@ -252,21 +251,3 @@ def _labelled(progress: Progress, label: str) -> Progress:
 
 def _live_progress(dialogue: Dialogue) -> Progress:
     return lambda text: dialogue.show_live(time.monotonic_ns(), lambda: Text(text))
-
-
-class DialogueOperator:
-    """The operator at a terminal: prompts as lines, `s` skips a step."""
-
-    def __init__(self, dialogue: Dialogue) -> None:
-        self._dialogue = dialogue
-
-    def prompt(self, text: str) -> None:
-        """Print the requested action."""
-        self._dialogue.print_line(f"{text} (s: skip)", "ask")
-
-    def has_skipped(self) -> bool:
-        """Return True for the key `s`; `q` ends the procedure as Ctrl-C does."""
-        key = self._dialogue.read_key()
-        if key is Key.QUIT:
-            raise KeyboardInterrupt
-        return key is Key.SKIP

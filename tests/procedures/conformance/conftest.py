@@ -18,7 +18,6 @@ from handtouch.procedures.conformance import (
     ConformanceOptions,
     NodeReport,
     NodeUnderTest,
-    Operator,
     run_checks,
 )
 
@@ -106,7 +105,7 @@ def line() -> SimulatedLine:
 def check(line: SimulatedLine) -> Callable[..., NodeReport]:
     """Run all checks of node 5; keyword arguments are those of `NodeUnderTest`."""
 
-    def run(options: ConformanceOptions = QUICK, operator: Operator | None = None, **node: Any) -> NodeReport:
+    def run(options: ConformanceOptions = QUICK, operator: Any = None, **node: Any) -> NodeReport:
         described = NodeUnderTest("can", NODE, **{"noise_counts": 2.0} | node)
         report = run_checks(line, described, options, operator=operator)
         assert [result.name for result in report.results] == list(CATALOGUE)

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from handtouch.canbus.nodes.boot import ExpectedIdentity
 from handtouch.config import shipped
 from handtouch.config.channels import WritableObject
 from handtouch.device import LineFaults
@@ -41,8 +40,10 @@ def test_the_shipped_node_passes_every_check_that_needs_no_operator(line: Any, c
     report = check(
         eds=EDS,
         excitation=WritableObject(0x2100, 0, 1),
-        pad="right/palm",
-        expected=ExpectedIdentity(vendor_id=0, product_code=0x401, serial=SERIAL),
+        name="right/palm",
+        vendor_id=0,
+        product_code=0x401,
+        serial=SERIAL,
     )
     assert report.failures == []
     assert report.ok
@@ -122,7 +123,7 @@ def test_an_eds_of_another_device_fails_with_its_objects(line: Any, check: Check
 
 def test_another_identity_than_that_of_the_deployment_fails(line: Any, check: Check) -> None:
     line.add()
-    report = check(pad="right/palm", expected=ExpectedIdentity(serial=1))
+    report = check(name="right/palm", serial=1)
     assert [result.name for result in report.failures] == ["identity.configured"]
 
 

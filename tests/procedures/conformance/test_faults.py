@@ -167,12 +167,12 @@ class Presser:
         self.line, self.device = line, device
         self.clears = True
 
-    def prompt(self, text: str) -> None:
+    def print_line(self, text: str, style: str = "") -> None:  # noqa: ARG002
         if "power" in text:
             self.line.at(500, lambda: self.device.brown_out(200 * MS))
         elif text.startswith("Cause"):
             self.line.at(500, lambda: self.device.send_emergency(0x3200, 5))
-        elif text == "Remove the error.":
+        elif text.startswith("Remove the error."):
             if self.clears:
                 self.line.at(500, lambda: self.device.send_emergency(0))
         elif text.startswith("Press"):
@@ -180,5 +180,5 @@ class Presser:
         else:
             self.line.at(500, lambda: self.line.counts.fill(0))
 
-    def has_skipped(self) -> bool:
-        return False
+    def read_key(self) -> None:
+        return None

@@ -34,9 +34,9 @@ def test_all_without_a_deployment_are_those_that_respond() -> None:
 def test_all_of_a_deployment_are_its_pads_with_what_it_states(hand: config.Deployment) -> None:
     targets = select_targets(hand, [], [], None)
     assert not targets.find_all
-    assert [node.pad for node in targets.nodes] == hand.pad_names
+    assert [node.name for node in targets.nodes] == hand.pad_names
     pad, node = hand.pads[0].pad, targets.nodes[0]
-    assert (node.node_id, node.expected.serial) == (pad.node_id, pad.serial)
+    assert (node.node_id, node.serial) == (pad.node_id, pad.serial)
     assert node.noise_counts == hand.nodes[pad.node].noise_counts
 
 
@@ -47,7 +47,7 @@ def test_pads_are_selected_by_pattern(hand: config.Deployment) -> None:
 
 def test_an_id_of_the_deployment_is_described_by_it(hand: config.Deployment) -> None:
     (node,) = select_targets(hand, [], ["2"], None).nodes
-    assert node.pad == "gripper/index_tip"
+    assert node.name == "gripper/index_tip"
 
 
 @pytest.mark.parametrize("role", ["guest", "listener"])

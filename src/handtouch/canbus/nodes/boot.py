@@ -6,12 +6,12 @@ They block until the node responds, so they run in a worker thread of the master
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 from handtouch.canbus import cia301
+from handtouch.canbus.nodes.spec import Identity, IdleSettings, NodeSpec
 from handtouch.canbus.objects.emergency import ReportedErrors
 from handtouch.canbus.objects.mapping import LENGTH_BIT_7, NodeTpdo, PdoMapping
 from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
@@ -27,60 +27,11 @@ MAX_HISTORY = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """Object 0x1018; None where the node doesn't have the sub-index."""
-
-    vendor_id: int
-    product_code: int | None = None
-    revision: int | None = None
-    serial: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Identification:
     """Result of `identify_node`."""
 
     identity: Identity
     errors: ReportedErrors
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedIdentity:
-    """Identity configured for a node; None is not checked. `serials_of_other_pads`, with the pads' names and
-    buses, are not accepted."""
-
-    vendor_id: int | None = None
-    product_code: int | None = None
-    revision: int | None = None
-    serial: int | None = None
-    serials_of_other_pads: Mapping[int, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class IdleSettings:
-    """Event-driven transmission while a pad is untouched: on changes beyond the delta, and by event timer."""
-
-    delta_counts: int
-    period_ms: int
-    inhibit_100us: int
-    delta_objects: tuple[WritableObject, ...]
-    enable_object: WritableObject | None
-
-
-class NodeSettings(Protocol):
-    """Settings written to a node."""
-
-    @property
-    def heartbeat_ms(self) -> int: ...
-
-    @property
-    def idle(self) -> IdleSettings | None: ...
-
-    @property
-    def excitation(self) -> WritableObject | None: ...
-
-    @property
-    def event_timer_ms(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +70,8 @@ def identify_node(sdo: NodeSdoClient) -> Identification:
     return Identification(read_identity(sdo), read_errors(sdo))
 
 
-def check_identity(identity: Identity, expected: ExpectedIdentity) -> None:
-    """Raise BootStepError unless a node is the expected one."""
+def check_identity(identity: Identity, expected: NodeSpec) -> None:
+    """Raise BootStepError unless a node is the expected one, and none of another pad."""
     owner = expected.serials_of_other_pads.get(identity.serial or 0)
     for sub, (name, key, actual, configured) in enumerate(
         (
@@ -199,7 +150,7 @@ def _check_sync_identifier(sdo: NodeSdoClient) -> None:
         f"write {sent} and store it"
     )
     try:
-        sdo.write_verified(cia301.SYNC_COB_ID, 0, cia301.SYNC, 4, name)
+        sdo.write_verified(cia301.SYNC_COB_ID, 0, cia301.SYNC, name)
     except BootStepError as error:
         if error.timed_out:
             raise
@@ -216,10 +167,10 @@ def _check_cob_id(sdo: NodeSdoClient, tpdo: NodeTpdo) -> None:
     try:
         _check_value(sdo, index, 1, tpdo.enabled_entry, name, form="0x{:X}")
     except BootStepError as error:
-        entry = sdo.read(index, 1, name)
+        entry = sdo.read_tpdo(tpdo.number, 1)
         if not error.timed_out and entry & cia301.IDENTIFIER_MASK != tpdo.cob_id:
-            sdo.write_if_different(index, 1, entry | cia301.INVALID_BIT, 4, name)
-            sdo.write_verified(index, 1, tpdo.disabled_entry, 4, name)
+            sdo.write_if_different(index, 1, entry | cia301.INVALID_BIT, name)
+            sdo.write_tpdo(tpdo.number, 1, tpdo.disabled_entry)
         raise
 
 
@@ -242,24 +193,22 @@ def _check_value(
 def configure_node(
     sdo: NodeSdoClient,
     mapping: PdoMapping,
-    settings: NodeSettings,
+    settings: NodeSpec,
     enter_preoperational: Callable[[], None],
     booted: bool = False,
-    sync_overflow: int = 0,
 ) -> NodeConfigured:
     """Write what differs, and read it back: PDOs enabled and synchronous, heartbeat time.
 
     A node that can't follow SYNC sends at the same rate by its event timer if all its channels are in one
     PDO. A node without heartbeat gets the heartbeat time as its guard time. The heartbeat time is always
     written to a node that has just `booted`: another node with the same id may have responded instead, and
-    only its heartbeats reveal it. `sync_overflow`: last value of the counter in SYNC, 0 without one.
-    `enter_preoperational` is called only if a PDO must be changed, which many
+    only its heartbeats reveal it. `enter_preoperational` is called only if a PDO must be changed, which many
     nodes refuse in state operational.
     """
     synchronous = _synchronous_type(mapping)
     if any(not tpdo.enabled or tpdo.transmission_type != synchronous for tpdo in mapping.tpdos):
         enter_preoperational()
-    _set_up_schedule(sdo, mapping, sync_overflow, enter_preoperational)
+    _set_up_schedule(sdo, mapping, settings.sync_overflow, enter_preoperational)
     refusal, event_timed = "", False
     single = len(mapping.tpdos) == 1  # several event-driven PDOs would not form one sample
     for tpdo in mapping.tpdos:
@@ -296,29 +245,17 @@ def prepare_idle(
     sdo: NodeSdoClient, tpdo: NodeTpdo, idle: IdleSettings, enter_preoperational: Callable[[], None]
 ) -> None:
     """Write the settings of an event-driven TPDO: inhibit time, event timer, and the channels' deltas."""
-    index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
-    settings = (
-        (3, idle.inhibit_100us, f"inhibit time of TPDO{tpdo.number}"),
-        (5, idle.period_ms, f"event timer of TPDO{tpdo.number}"),
-    )
-    changes = [(sub, value, name) for sub, value, name in settings if sdo.read(index, sub, name) != value]
+    settings = ((3, idle.inhibit_100us), (5, idle.period_ms))
+    changes = [(sub, value) for sub, value in settings if sdo.read_tpdo(tpdo.number, sub) != value]
     if changes:  # CiA 301: not while the PDO is valid
         enter_preoperational()
         with _tpdo_disabled(sdo, tpdo):
-            for sub, value, name in changes:
-                sdo.write_verified(index, sub, value, 2, name)
+            for sub, value in changes:
+                sdo.write_tpdo(tpdo.number, sub, value)
     for delta in idle.delta_objects:
-        sdo.write_if_different(
-            delta.index, delta.sub, idle.delta_counts, delta.size_bytes, "delta of a channel"
-        )
+        sdo.set_object(delta, idle.delta_counts, "delta of a channel")
     if idle.enable_object is not None:
-        sdo.write_if_different(
-            idle.enable_object.index,
-            idle.enable_object.sub,
-            1,
-            idle.enable_object.size_bytes,
-            "enabling of events",
-        )
+        sdo.set_object(idle.enable_object, 1, "enabling of events")
 
 
 def set_transmission(sdo: NodeSdoClient, tpdo: NodeTpdo, idle: bool) -> None:
@@ -334,37 +271,34 @@ def synchronous_request(tpdo: NodeTpdo) -> bytes:
 def set_excitation(sdo: NodeSdoClient, excitation: WritableObject | None, on: bool) -> None:
     """Switch the excitation of a pad on or off, where the node supports it."""
     if excitation is not None:
-        sdo.write_if_different(excitation.index, excitation.sub, int(on), excitation.size_bytes, "excitation")
+        sdo.set_object(excitation, int(on), "excitation")
 
 
 def _set_transmission_type(sdo: NodeSdoClient, tpdo: NodeTpdo, kind: int) -> None:
     """Write a running node's TPDO's transmission type, with the TPDO disabled where the node requires
     that."""
-    index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
-    name = f"transmission type of TPDO{tpdo.number}"
     try:
-        sdo.write_verified(index, 2, kind, 1, name)
+        sdo.write_tpdo(tpdo.number, 2, kind)
     except BootStepError as error:
         if error.timed_out or not tpdo.enabled:
             raise
         with _tpdo_disabled(sdo, tpdo):
-            sdo.write_verified(index, 2, kind, 1, name)
+            sdo.write_tpdo(tpdo.number, 2, kind)
 
 
 def _set_type_while_disabled(sdo: NodeSdoClient, tpdo: NodeTpdo, kind: int) -> None:
     """Write a TPDO's transmission type while the TPDO is disabled: some nodes take it over when it is
     enabled."""
-    index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"transmission type of TPDO{tpdo.number}"
     if tpdo.enabled:
         try:
             with _tpdo_disabled(sdo, tpdo):
-                sdo.write_verified(index, 2, kind, 1, name)
+                sdo.write_tpdo(tpdo.number, 2, kind)
         except BootStepError as error:
             if error.timed_out:
                 raise
         else:
             return
-    sdo.write_verified(index, 2, kind, 1, name)
+    sdo.write_tpdo(tpdo.number, 2, kind)
 
 
 def _end_inhibition(sdo: NodeSdoClient, tpdo: NodeTpdo, enter_preoperational: Callable[[], None]) -> None:
@@ -373,7 +307,7 @@ def _end_inhibition(sdo: NodeSdoClient, tpdo: NodeTpdo, enter_preoperational: Ca
     if sdo.read_if_present(index, 3, name):
         enter_preoperational()
         with _tpdo_disabled(sdo, tpdo):
-            sdo.write_verified(index, 3, 0, 2, name)
+            sdo.write_tpdo(tpdo.number, 3, 0)
 
 
 def _synchronous_type(mapping: PdoMapping) -> int:
@@ -399,30 +333,26 @@ def _set_up_schedule(
         )
     if overflow is not None and overflow != sync_overflow:
         enter_preoperational()
-        sdo.write_verified(cia301.SYNC_OVERFLOW, 0, sync_overflow, 1, name)
+        sdo.write_verified(cia301.SYNC_OVERFLOW, 0, sync_overflow, name)
     for tpdo, state in zip(mapping.tpdos, mapping.states, strict=False):
-        index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"SYNC start value of TPDO{tpdo.number}"
-        if sdo.read(index, cia301.SYNC_START_SUB, name) != state + 1:
+        if sdo.read_tpdo(tpdo.number, cia301.SYNC_START_SUB) != state + 1:
             enter_preoperational()
             with _tpdo_disabled(sdo, tpdo):  # CiA 301: not while the PDO is valid
-                sdo.write_verified(index, cia301.SYNC_START_SUB, state + 1, 1, name)
+                sdo.write_tpdo(tpdo.number, cia301.SYNC_START_SUB, state + 1)
 
 
 def _set_event_timer(sdo: NodeSdoClient, tpdo: NodeTpdo, period_ms: int) -> None:
     """Write a TPDO's event timer, with the TPDO disabled as CiA 301 requires."""
-    index, name = cia301.TPDO_COMMUNICATION + tpdo.number - 1, f"event timer of TPDO{tpdo.number}"
-    if sdo.read(index, 5, name) != period_ms:
+    if sdo.read_tpdo(tpdo.number, 5) != period_ms:
         with _tpdo_disabled(sdo, tpdo):
-            sdo.write_verified(index, 5, period_ms, 2, name)
+            sdo.write_tpdo(tpdo.number, 5, period_ms)
 
 
 @contextmanager
 def _tpdo_disabled(sdo: NodeSdoClient, tpdo: NodeTpdo) -> Iterator[None]:
     """Disable a TPDO, and enable it again afterwards, even if the node refuses a write in between."""
     try:
-        sdo.write_verified(
-            cia301.TPDO_COMMUNICATION + tpdo.number - 1, 1, tpdo.disabled_entry, 4, _identifier_name(tpdo)
-        )
+        sdo.write_tpdo(tpdo.number, 1, tpdo.disabled_entry)
         yield
         _enable_tpdo(sdo, tpdo)
     except BootStepError as error:
@@ -432,13 +362,8 @@ def _tpdo_disabled(sdo: NodeSdoClient, tpdo: NodeTpdo) -> Iterator[None]:
 
 
 def _enable_tpdo(sdo: NodeSdoClient, tpdo: NodeTpdo) -> None:
-    sdo.write_if_different(
-        cia301.TPDO_COMMUNICATION + tpdo.number - 1, 1, tpdo.enabled_entry, 4, _identifier_name(tpdo)
-    )
-
-
-def _identifier_name(tpdo: NodeTpdo) -> str:
-    return f"COB-ID of TPDO{tpdo.number}"
+    if sdo.read_tpdo(tpdo.number, 1) != tpdo.enabled_entry:
+        sdo.write_tpdo(tpdo.number, 1, tpdo.enabled_entry)
 
 
 def _set_up_supervision(sdo: NodeSdoClient, period_ms: int, booted: bool) -> bool:
@@ -446,9 +371,9 @@ def _set_up_supervision(sdo: NodeSdoClient, period_ms: int, booted: bool) -> boo
     heartbeat = sdo.read_optional(cia301.HEARTBEAT_TIME, 0, "heartbeat time")
     if heartbeat is not None:
         if booted or heartbeat != period_ms:
-            sdo.write_verified(cia301.HEARTBEAT_TIME, 0, period_ms, 2, "heartbeat time")
+            sdo.write_verified(cia301.HEARTBEAT_TIME, 0, period_ms, "heartbeat time")
         return False
     if sdo.read_optional(cia301.GUARD_TIME, 0, "guard time") is not None:
-        sdo.write_if_different(cia301.GUARD_TIME, 0, period_ms, 2, "guard time")
-        sdo.write_if_different(cia301.LIFE_TIME_FACTOR, 0, LIFE_TIME_FACTOR, 1, "life time factor")
+        sdo.write_if_different(cia301.GUARD_TIME, 0, period_ms, "guard time")
+        sdo.write_if_different(cia301.LIFE_TIME_FACTOR, 0, LIFE_TIME_FACTOR, "life time factor")
     return True

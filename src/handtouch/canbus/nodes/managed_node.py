@@ -21,7 +21,7 @@ from handtouch.canbus.nodes.lifecycle_types import (
     StepDone,
     StepFailed,
 )
-from handtouch.canbus.nodes.spec import NodeSpec, NodeStatus
+from handtouch.canbus.nodes.spec import Identity, NodeSpec, NodeStatus
 from handtouch.canbus.objects.emergency import ErrorLog, ReportedErrors
 from handtouch.canbus.objects.mapping import PdoMapping, mapping_from_eds, read_mapping, tpdo_numbers
 from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
@@ -50,7 +50,7 @@ class ManagedNode:
     sdo: SdoTransport
     lifecycle: Lifecycle = field(default_factory=Lifecycle)
     excused_ns: int = 0  # sum of the loop's pauses that its timeouts include
-    identity: boot.Identity | None = None
+    identity: Identity | None = None
     mapping: PdoMapping | None = None
     claimed_ids: frozenset[int] = frozenset()  # COB-IDs of the TPDOs that carry its channels, routed or not
     sdo_lock: threading.Lock = field(default_factory=threading.Lock)  # one transfer at a time
@@ -137,7 +137,7 @@ def run_step(
     try:
         result = _perform_step(node, NodeSdoClient(node.sdo, is_cancelled), step, idle)
         if isinstance(result, boot.Identification):  # published even if it is that of a wrong device
-            boot.check_identity(result.identity, _expected_identity(node.spec))
+            boot.check_identity(result.identity, node.spec)
     except BootStepCancelled:
         return None, None
     except BootStepError as error:
@@ -146,12 +146,6 @@ def run_step(
     except Exception as error:  # noqa: BLE001 - the future would hide it; here it becomes the node's reason
         outcome = StepFailed(step, attempt, f"unexpected {type(error).__name__}: {error}")
     return outcome, result
-
-
-def _expected_identity(spec: NodeSpec) -> boot.ExpectedIdentity:
-    return boot.ExpectedIdentity(
-        spec.vendor_id, spec.product_code, spec.revision, spec.serial, spec.serials_of_other_pads
-    )
 
 
 def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle: bool) -> StepResult | None:
@@ -187,7 +181,7 @@ def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle:
     if step is NodeAction.SET_TRANSMISSION:
         boot.set_transmission(sdo, node.mapping.tpdos[0], idle)
         return boot.TransmissionSet(idle)
-    return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted, spec.sync_overflow)
+    return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted)
 
 
 def send_nmt(node: ManagedNode, action: NodeAction) -> None:

@@ -55,6 +55,7 @@ from handtouch.canbus.nodes.owners import NMT_COMMAND, UNKNOWN_SENDER, find_owne
 from handtouch.canbus.nodes.sample_rates import SampleRates
 from handtouch.canbus.nodes.spec import (
     ErrorChanged,
+    Identity,
     MasterEvent,
     NodeEvent,
     NodeSpec,
@@ -508,7 +509,7 @@ class Master:
         self.idle[slot] = idle
         self.transmission_changes += 1
 
-    def _update_identity(self, node: ManagedNode, identity: boot.Identity, now_ns: int) -> None:
+    def _update_identity(self, node: ManagedNode, identity: Identity, now_ns: int) -> None:
         before = node.identity
         node.identity = identity
         if before is not None and before.serial != identity.serial:

@@ -1,7 +1,7 @@
 """Nodes of a deployment as the master gets them, and their status and events as it reports them.
 
-Public names: `NodeSpec`, `node_specs`, `sync_overflows`, `check_nodes`, `NodeStatus`; `MasterEvent`, a union
-of `NodeEvent`, `ErrorChanged` and `SerialChanged`.
+Public names: `Identity`, `IdleSettings`, `NodeSpec`, `node_specs`, `sync_overflows`, `check_nodes`,
+`NodeStatus`; `MasterEvent`, a union of `NodeEvent`, `ErrorChanged` and `SerialChanged`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from handtouch.canbus.nodes.boot import Identity, IdleSettings
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.objects.mapping import mapping_from_eds
 from handtouch.config import (
@@ -36,6 +35,27 @@ from handtouch.wire.emergency import Emergency
 
 
 @dataclass(frozen=True, slots=True)
+class Identity:
+    """Object 0x1018; None where the node doesn't have the sub-index."""
+
+    vendor_id: int
+    product_code: int | None = None
+    revision: int | None = None
+    serial: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class IdleSettings:
+    """Event-driven transmission while a pad is untouched: on changes beyond the delta, and by event timer."""
+
+    delta_counts: int
+    period_ms: int
+    inhibit_100us: int
+    delta_objects: tuple[WritableObject, ...]
+    enable_object: WritableObject | None
+
+
+@dataclass(frozen=True, slots=True)
 class NodeSpec:
     """A node of the deployment; identity fields that are None are not checked.
 
@@ -45,7 +65,8 @@ class NodeSpec:
     `event_timer_ms` : period of a node that can't follow SYNC
     `channel_states` : of a pad with a schedule, the state in which each channel is measured
     `sync_overflow` : last value of the counter in SYNC, 0 where SYNC has none
-    `serials_of_other_pads` : serial numbers configured for other pads, with their names and buses
+    `serials_of_other_pads` : serial numbers configured for other pads, which are not accepted, with the
+    pads' names and buses
     """
 
     slot: int

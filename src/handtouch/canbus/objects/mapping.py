@@ -1,6 +1,7 @@
 """PDO mapping of a node's channels: read from the node, taken from its EDS, or written to the node.
 
-Public names: `NodeTpdo`, `PdoMapping`, `find_channels`, `mapping_from_eds`, `tpdo_numbers`, `read_mapping`.
+Public names: `NodeTpdo`, `PdoMapping`, `find_channels`, `mapping_from_eds`, `tpdo_numbers`, `read_mapping`,
+`write_entries`.
 """
 
 from __future__ import annotations
@@ -229,10 +230,9 @@ def _read_entries(sdo: NodeSdoClient, number: int) -> tuple[int, ...] | None:
 
 
 def _read_communication(sdo: NodeSdoClient, tpdo: NodeTpdo) -> NodeTpdo:
-    index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
-    cob_id = sdo.read(index, 1, f"COB-ID of TPDO{tpdo.number}")
+    cob_id = sdo.read_tpdo(tpdo.number, 1)
     identifier = _check_identifier(tpdo.number, cob_id, cob_id & cia301.IDENTIFIER_MASK)
-    transmission = sdo.read(index, 2, f"transmission type of TPDO{tpdo.number}")
+    transmission = sdo.read_tpdo(tpdo.number, 2)
     enabled = not cob_id & cia301.INVALID_BIT
     return NodeTpdo(tpdo.number, identifier, enabled, transmission, tpdo.entries, cob_id & cia301.NO_RTR_BIT)
 
@@ -287,33 +287,33 @@ def _remap(
 
 def _map_channels(sdo: NodeSdoClient, node_id: int, number: int, entries: tuple[int, ...]) -> NodeTpdo:
     """Map a TPDO as CiA 301 requires: disable it, then clear, write and count its entries."""
-    communication, mapping = cia301.TPDO_COMMUNICATION + number - 1, cia301.TPDO_MAPPING + number - 1
-    mapping_name, identifier_name = f"mapping of TPDO{number}", f"COB-ID of TPDO{number}"
-    cob_id = sdo.read(communication, 1, identifier_name)
+    cob_id = sdo.read_tpdo(number, 1)
     identifier = cob_id & cia301.IDENTIFIER_MASK
     if not identifier and number <= cia301.PREDEFINED_TPDOS:
         identifier = cia301.tpdo_identifier(number) + node_id
     no_rtr_bit = cob_id & cia301.NO_RTR_BIT
     tpdo = NodeTpdo(number, _check_identifier(number, cob_id, identifier), False, 0, entries, no_rtr_bit)
     before = _read_entries(sdo, number) or ()
-    sdo.write_if_different(communication, 1, tpdo.disabled_entry, 4, identifier_name)
+    if sdo.read_tpdo(number, 1) != tpdo.disabled_entry:
+        sdo.write_tpdo(number, 1, tpdo.disabled_entry)
     try:
-        _write_entries(sdo, mapping, entries, mapping_name)
+        write_entries(sdo, number, entries)
     except BootStepError as error:
         if not error.timed_out:  # as it was: the node doesn't accept the change
             with contextlib.suppress(BootStepError):
-                _write_entries(sdo, mapping, before, mapping_name)
-                sdo.write_verified(communication, 1, cob_id, 4, identifier_name)
+                write_entries(sdo, number, before)
+                sdo.write_tpdo(number, 1, cob_id)
         raise
-    transmission = sdo.read(communication, 2, f"transmission type of TPDO{number}")
-    return replace(tpdo, transmission_type=transmission)
+    return replace(tpdo, transmission_type=sdo.read_tpdo(number, 2))
 
 
-def _write_entries(sdo: NodeSdoClient, mapping: int, entries: Sequence[int], name: str) -> None:
-    sdo.write_if_different(mapping, 0, 0, 1, name)
+def write_entries(sdo: NodeSdoClient, number: int, entries: Sequence[int]) -> None:
+    """Map objects to a disabled TPDO."""
+    index, name = cia301.TPDO_MAPPING + number - 1, f"mapping of TPDO{number}"
+    sdo.write_if_different(index, 0, 0, name)
     for sub, entry in enumerate(entries, 1):
-        sdo.write_verified(mapping, sub, entry, 4, name)
-    sdo.write_verified(mapping, 0, len(entries), 1, name)
+        sdo.write_verified(index, sub, entry, name)
+    sdo.write_verified(index, 0, len(entries), name)
 
 
 def _group_by_pdo(channels: Sequence[Channel]) -> list[list[Channel]]:

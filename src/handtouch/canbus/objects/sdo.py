@@ -16,12 +16,20 @@ from canopen import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from handtouch.canbus import cia301
+from handtouch.config.channels import WritableObject
 
 SDO_TIMEOUT_S = 0.2
 MAX_SDO_ATTEMPTS = 2
 """A lost frame costs one timeout; a node that responds to neither attempt is silent."""
 
 _MAX_RECEIVER_POLLS = 20
+_TPDO_PARAMETERS = {
+    1: "COB-ID",
+    2: "transmission type",
+    3: "inhibit time",
+    5: "event timer",
+    cia301.SYNC_START_SUB: "SYNC start value",
+}
 _COMMANDS_WITH_OBJECT = (0x40, 0x60, 0x80)  # responses with index and sub-index: upload, download, abort
 _NO_OBJECT_ABORT_CODES = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})
 
@@ -191,6 +199,11 @@ class SdoTransport:
         return f"no valid SDO response {limit}; received: {dropped.hex(' ') or 'no data'}"
 
 
+def _tpdo_parameter(number: int, sub: int) -> tuple[int, int, str]:
+    """Return index, sub-index and name of a parameter of a TPDO."""
+    return cia301.TPDO_COMMUNICATION + number - 1, sub, f"{_TPDO_PARAMETERS[sub]} of TPDO{number}"
+
+
 def _never_cancelled() -> bool:
     return False
 
@@ -244,18 +257,35 @@ class NodeSdoClient:
                 return None
             raise
 
-    def write_verified(self, index: int, sub: int, value: int, size: int, name: str) -> None:
-        """Write an object of `size` bytes and read it back."""
+    def write_verified(self, index: int, sub: int, value: int, name: str, size: int | None = None) -> None:
+        """Write an object and read it back; `size` as in `read`."""
+        size = size or cia301.object_bytes(index, sub)
+        assert size is not None
         data = value.to_bytes(size, "little")
         self._transfer(index, sub, f"writing {name}", lambda c: c.download(index, sub, data))
         actual = self.read(index, sub, name, size)
         if actual != value:
             raise BootStepError(f"{name}, 0x{index:04X}:{sub:02X}, was set to {value} but reads {actual}")
 
-    def write_if_different(self, index: int, sub: int, value: int, size: int, name: str) -> None:
+    def write_if_different(
+        self, index: int, sub: int, value: int, name: str, size: int | None = None
+    ) -> None:
         """Write and verify an object unless it has the value already."""
         if self.read(index, sub, name, size) != value:
-            self.write_verified(index, sub, value, size, name)
+            self.write_verified(index, sub, value, name, size)
+
+    def set_object(self, target: WritableObject, value: int, name: str) -> None:
+        """Write and verify an object of the deployment unless it has the value already."""
+        self.write_if_different(target.index, target.sub, value, name, target.size_bytes)
+
+    def read_tpdo(self, number: int, sub: int) -> int:
+        """Read a parameter of a TPDO, 0x1800 + n."""
+        return self.read(*_tpdo_parameter(number, sub))
+
+    def write_tpdo(self, number: int, sub: int, value: int) -> None:
+        """Write a parameter of a TPDO and read it back."""
+        index, sub, name = _tpdo_parameter(number, sub)
+        self.write_verified(index, sub, value, name)
 
     def _transfer(
         self, index: int, sub: int, description: str, run: Callable[[SdoClient], bytes | None]

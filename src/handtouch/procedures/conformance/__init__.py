@@ -22,7 +22,7 @@ from handtouch.procedures.conformance.results import (
     Verdict,
     count_verdicts,
 )
-from handtouch.procedures.conformance.session import ConformanceOptions, NodeUnderTest, Operator
+from handtouch.procedures.conformance.session import ConformanceOptions, NodeUnderTest
 from handtouch.procedures.conformance.targets import Targets, select_targets
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "Line",
     "NodeReport",
     "NodeUnderTest",
-    "Operator",
     "PortLine",
     "RateMeasurement",
     "Targets",

@@ -1,13 +1,13 @@
 """SDO client that waits for the response in the calling thread, and reports every violation of the protocol.
 
-Public names: `DirectSdoClient`, `DirectTransport`, `NoResponseError`, `InvalidResponseError`.
+Public names: `DirectSdoClient`, `NoResponseError`, `InvalidResponseError`.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
@@ -40,7 +40,8 @@ class DirectSdoClient:
 
     `violations` : texts of the invalid responses; `lost` : number of requests without a response
 
-    Methods raise SdoAbortedError for an abort, NoResponseError, or InvalidResponseError.
+    It is the transport of a `NodeSdoClient`, too. `upload` and `download` raise SdoAbortedError for an abort,
+    NoResponseError, or InvalidResponseError.
     """
 
     def __init__(self, exchange: SdoExchange) -> None:
@@ -63,6 +64,25 @@ class DirectSdoClient:
             raise ValueError(f"need one to four bytes, got {len(data)}")
         request = _HEAD.pack(0x23 | 4 - len(data) << 2, index, sub) + data.ljust(4, b"\0")
         self._request(request, _DOWNLOAD, _name(index, sub))
+
+    def transfer(
+        self,
+        index: int,  # noqa: ARG002 - the description has it
+        sub: int,  # noqa: ARG002
+        description: str,
+        run: Callable[[DirectSdoClient], bytes | None],
+        is_cancelled: Callable[[], bool],  # noqa: ARG002 - nothing cancels a transfer here
+    ) -> bytes | None:
+        """Run an upload or download of a `NodeSdoClient`, with one retry. Raises BootStepError."""
+        error: SdoCommunicationError | None = None
+        for _ in range(MAX_SDO_ATTEMPTS):
+            try:
+                return run(self)
+            except SdoAbortedError as abort:
+                raise BootStepError(f"{description}: refused by the node ({abort})") from abort
+            except SdoCommunicationError as failure:
+                error = failure
+        raise BootStepError(f"{description}: {error}", timed_out=True) from error
 
     def _upload_segments(self, index: int, sub: int, size: int | None) -> bytes:
         name, data, toggle = _name(index, sub), b"", 0
@@ -103,32 +123,6 @@ class DirectSdoClient:
     def _invalid(self, name: str, text: str) -> InvalidResponseError:
         self.violations.append(f"{name}: {text}")
         return InvalidResponseError(text)
-
-
-class DirectTransport:
-    """Transport of a `NodeSdoClient` in the calling thread."""
-
-    def __init__(self, client: DirectSdoClient) -> None:
-        self._client = client
-
-    def transfer(
-        self,
-        index: int,  # noqa: ARG002 - the description has it
-        sub: int,  # noqa: ARG002
-        description: str,
-        run: Callable[[Any], bytes | None],
-        is_cancelled: Callable[[], bool],  # noqa: ARG002 - nothing cancels a transfer here
-    ) -> bytes | None:
-        """Run an upload or download, with one retry. Raises BootStepError."""
-        error: SdoCommunicationError | None = None
-        for _ in range(MAX_SDO_ATTEMPTS):
-            try:
-                return run(self._client)
-            except SdoAbortedError as abort:
-                raise BootStepError(f"{description}: refused by the node ({abort})") from abort
-            except SdoCommunicationError as failure:
-                error = failure
-        raise BootStepError(f"{description}: {error}", timed_out=True) from error
 
 
 def _name(index: int, sub: int) -> str:

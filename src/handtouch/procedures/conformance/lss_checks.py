@@ -23,16 +23,14 @@ def check_lss(session: NodeSession) -> None:
     elif identity is None or None in (identity.product_code, identity.revision, identity.serial):
         why = "the identity is incomplete"
     if why or identity is None:
-        for name in names:
-            report.not_tested(name, why)
+        report.not_tested(why, *names)
         return
     address = LssAddress(
         identity.vendor_id, identity.product_code or 0, identity.revision or 0, identity.serial or 0
     )
     if not _select(session, address):
         _deselect(session)
-        for name in names:
-            report.not_tested(name, "no response to LSS; needed only where LSS is to assign the node id")
+        report.not_tested("no response to LSS; needed only where LSS is to assign the node id", *names)
         return
     compares = not _answers_other_scan(session)
     _deselect(session)

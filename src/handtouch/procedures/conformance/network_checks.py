@@ -26,7 +26,7 @@ def check_heartbeat(session: NodeSession) -> None:
     if not session.has_heartbeat:
         _check_guarding(session)
         return
-    report.not_tested("guarding.response", "the node sends heartbeats")
+    report.not_tested("the node sends heartbeats", "guarding.response")
     period_ms = session.node.heartbeat_ms
     before = len(link.heartbeats)
     link.wait(_HEARTBEATS * period_ms * MS + period_ms * MS // 2)
@@ -41,13 +41,13 @@ def check_heartbeat(session: NodeSession) -> None:
         hint = "; twice as often: two nodes with this id?" if mean < 0.7 * period_ms else ""
         report.assess("heartbeat.period", [text + hint] if off else [], text)
     try:
-        session.sdo.write_verified(cia301.HEARTBEAT_TIME, 0, 0, 2, "heartbeat time")
+        session.sdo.write_verified(cia301.HEARTBEAT_TIME, 0, 0, "heartbeat time")
         link.wait(2 * MS)
         before = len(link.heartbeats)
         link.wait(3 * period_ms * MS)
         more = len(link.heartbeats) - before
         report.assess("heartbeat.off", [f"{more} heartbeats with 0x1017 = 0"] if more else [])
-        session.sdo.write_verified(cia301.HEARTBEAT_TIME, 0, period_ms, 2, "heartbeat time")
+        session.sdo.write_verified(cia301.HEARTBEAT_TIME, 0, period_ms, "heartbeat time")
     except BootStepError as error:
         report.failed("heartbeat.off", str(error))
 
@@ -56,8 +56,8 @@ def check_states(session: NodeSession) -> None:
     """Check the NMT states and what the node sends in each; it ends in pre-operational."""
     link, report = session.link, session.report
     if not session.shows_state:
-        for name in ("nmt.preoperational", "nmt.operational", "nmt.stopped", "nmt.addressed"):
-            report.not_tested(name, "neither heartbeat nor guarding, so its NMT state can't be observed")
+        why = "neither heartbeat nor guarding, so its NMT state can't be observed"
+        report.not_tested(why, "nmt.preoperational", "nmt.operational", "nmt.stopped", "nmt.addressed")
         return
     state = session.enter(cia301.ENTER_PREOPERATIONAL, cia301.PREOPERATIONAL)
     problems = _describe_state(state, cia301.PREOPERATIONAL)
@@ -93,7 +93,7 @@ def check_reset(session: NodeSession, name: str, command: int) -> None:
     """Check a reset; the node's power-on state is left by `start_heartbeat`."""
     link, report = session.link, session.report
     if not session.options.resets:
-        report.not_tested(name, "left out by --no-reset")
+        report.not_tested("left out by --no-reset", name)
         return
     before = len(link.boot_ups)
     if not link.reset(command, BOOT_TIMEOUT_NS):
@@ -128,7 +128,7 @@ def summarise_errors(session: NodeSession) -> None:
         if link.emergencies or problems:
             report.assess("emcy.format", problems)
         else:
-            report.not_tested("emcy.format", "the node sent no EMCY message")
+            report.not_tested("the node sent no EMCY message", "emcy.format")
         report.assess("emcy.none", _describe_errors(session))
     except BootStepError as error:
         report.failed("emcy.none", str(error))
@@ -142,12 +142,12 @@ def summarise_errors(session: NodeSession) -> None:
 
 def _check_guarding(session: NodeSession) -> None:
     link, report = session.link, session.report
-    report.not_tested("heartbeat.off", "no heartbeat")
+    report.not_tested("no heartbeat", "heartbeat.off")
     if _has_heartbeat_object(session):
         report.failed("heartbeat.period", "no heartbeat after 0x1017 was written")
-        report.not_tested("guarding.response", "the node has 0x1017")
+        report.not_tested("the node has 0x1017", "guarding.response")
         return
-    report.not_tested("heartbeat.period", "no 0x1017")
+    report.not_tested("no 0x1017", "heartbeat.period")
     start = len(link.heartbeats)
     for number in range(1, _GUARD_REQUESTS + 1):
         link.send_guard_request()

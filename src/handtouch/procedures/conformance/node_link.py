@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from handtouch.canbus import cia301
 from handtouch.canbus.objects.emergency import decode_emergency
 from handtouch.canbus.objects.sdo import SDO_TIMEOUT_S
-from handtouch.procedures.conformance.direct_sdo import DirectSdoClient, DirectTransport
+from handtouch.procedures.conformance.direct_sdo import DirectSdoClient
 from handtouch.procedures.conformance.line import Line
 from handtouch.wire.emergency import Emergency
 
@@ -70,7 +70,6 @@ class NodeLink:
         self.foreign: set[int] = set()
         self.other_nodes: set[int] = set()
         self.client = DirectSdoClient(self.exchange_sdo)
-        self.transport = DirectTransport(self.client)
         self._line = line
         self._responses: deque[bytes] = deque()
         self._lss_responses: deque[bytes] = deque()

@@ -6,11 +6,12 @@ import math
 import statistics
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.boot import configure_node, set_transmission
-from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping, read_mapping
+from handtouch.canbus.objects.mapping import NodeTpdo, PdoMapping, read_mapping, write_entries
 from handtouch.canbus.objects.sdo import BootStepError
 from handtouch.core.slab import ChannelField
 from handtouch.procedures.conformance.node_link import MS, SyncCycle
@@ -49,8 +50,7 @@ def check_mapping(session: NodeSession) -> None:
         mapping = read_mapping(session.sdo, node.node_id, node.tpdo_numbers, node.channels, may_remap)
     except BootStepError as error:
         report.failed("pdo.mapping", str(error))
-        for name in _TPDO_CHECKS + _STREAM_CHECKS:
-            report.not_tested(name, "no TPDO with the channels")
+        report.not_tested("no TPDO with the channels", *_TPDO_CHECKS, *_STREAM_CHECKS)
         return
     session.mapping = mapping
     session.link.pdo_ids = {tpdo.cob_id for tpdo in mapping.tpdos}
@@ -66,11 +66,9 @@ def configure(session: NodeSession) -> None:
     remapping = []
     try:
         for tpdo in mapping.tpdos:
-            index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
-            name = f"COB-ID of TPDO{tpdo.number}"
-            session.sdo.write_verified(index, 1, tpdo.disabled_entry, 4, name)
+            session.sdo.write_tpdo(tpdo.number, 1, tpdo.disabled_entry)
             remapping += _remap(session, tpdo)
-            session.sdo.write_verified(index, 1, tpdo.enabled_entry, 4, name)
+            session.sdo.write_tpdo(tpdo.number, 1, tpdo.enabled_entry)
         enabled = PdoMapping(tuple(_as_enabled(tpdo) for tpdo in mapping.tpdos), mapping.layout)
         result = configure_node(session.sdo, enabled, session.node, session.enter_preoperational)
     except BootStepError as error:
@@ -80,7 +78,7 @@ def configure(session: NodeSession) -> None:
     if not remapping:
         report.passed("pdo.remapping")
     elif all(constant for constant, _ in remapping):
-        report.not_tested("pdo.remapping", "the mapping is read-only, which is allowed")
+        report.not_tested("the mapping is read-only, which is allowed", "pdo.remapping")
     else:
         report.failed("pdo.remapping", "; ".join(text for constant, text in remapping if not constant))
 
@@ -89,16 +87,14 @@ def check_stream(session: NodeSession) -> None:
     """Check the TPDOs of an operational node: silence, answers to SYNC at each rate, counts."""
     mapping, report = session.mapping, session.report
     if mapping is None or report.verdict("pdo.configure") is Verdict.FAILED:
-        for name in _STREAM_CHECKS:
-            report.not_tested(name, "the TPDO can't be configured")
+        report.not_tested("the TPDO can't be configured", *_STREAM_CHECKS)
         return
     state = session.enter(cia301.START_NODE, cia301.OPERATIONAL)
     link = session.link
     if state not in (None, cia301.OPERATIONAL) and not any(
         cycle.pdos for cycle in link.send_syncs(_TRIAL_PERIOD_NS, _TRIAL_SYNCS)
     ):
-        for name in _STREAM_CHECKS:
-            report.not_tested(name, "the node doesn't enter operational")
+        report.not_tested("the node doesn't enter operational", *_STREAM_CHECKS)
         return
     link.pdos.clear()
     link.wait(_SILENCE_NS)
@@ -121,7 +117,7 @@ def check_stream(session: NodeSession) -> None:
     if lengths:
         report.assess("pdo.length", wrong)
     else:
-        report.not_tested("pdo.length", "no TPDO")
+        report.not_tested("no TPDO", "pdo.length")
     _assess_counts(session, mapping, counts)
     _check_event_timer(session, mapping)
 
@@ -194,10 +190,10 @@ def _assess_rates(session: NodeSession) -> None:
     report.assess("pdo.complete", lost)
     period_error = max(rate.worst_sync_error_us / 1e3 / rate.period_ms for rate in report.rates)
     if not texts:
-        report.not_tested("pdo.delay", "no TPDO")
+        report.not_tested("no TPDO", "pdo.delay")
     elif late and period_error > _MAX_SYNC_ERROR:
         paused = f"this computer paused: its SYNCs were up to {period_error:.0%} of a period early or late"
-        report.not_tested("pdo.delay", f"{paused}; {'; '.join(late)}")
+        report.not_tested(f"{paused}; {'; '.join(late)}", "pdo.delay")
     else:
         report.assess("pdo.delay", late, "; ".join(texts))
 
@@ -205,8 +201,7 @@ def _assess_rates(session: NodeSession) -> None:
 def _assess_counts(session: NodeSession, mapping: PdoMapping, counts: Counts) -> None:
     report = session.report
     if len(counts) < 2:
-        report.not_tested("channels.range", "no samples")
-        report.not_tested("channels.noise", "no samples")
+        report.not_tested("no samples", "channels.range", "channels.noise")
         return
     range_problems, noise_problems = [], []
     columns = list(zip(*counts, strict=True))
@@ -235,18 +230,18 @@ def _check_event_timer(session: NodeSession, mapping: PdoMapping) -> None:
     """Check the event-driven transmission that handtouch uses while a pad is idle."""
     report, link = session.report, session.link
     if len(mapping.tpdos) > 1:
-        report.not_tested("pdo.event_timer", "the channels are in several TPDOs, so idling isn't used")
+        report.not_tested("the channels are in several TPDOs, so idling isn't used", "pdo.event_timer")
         return
     tpdo = _as_enabled(mapping.tpdos[0])
     index = cia301.TPDO_COMMUNICATION + tpdo.number - 1
     try:
         if session.sdo.read_optional(index, 5, "event timer") is None:
-            report.not_tested("pdo.event_timer", f"no event timer (0x{index:04X}:05), which is allowed")
+            report.not_tested(f"no event timer (0x{index:04X}:05), which is allowed", "pdo.event_timer")
             return
         session.enter_preoperational()
-        session.sdo.write_verified(index, 1, tpdo.disabled_entry, 4, "COB-ID")
-        session.sdo.write_verified(index, 5, _EVENT_TIMER_MS, 2, "event timer")
-        session.sdo.write_verified(index, 1, tpdo.enabled_entry, 4, "COB-ID")
+        session.sdo.write_tpdo(tpdo.number, 1, tpdo.disabled_entry)
+        session.sdo.write_tpdo(tpdo.number, 5, _EVENT_TIMER_MS)
+        session.sdo.write_tpdo(tpdo.number, 1, tpdo.enabled_entry)
         set_transmission(session.sdo, tpdo, True)
     except BootStepError as error:
         report.failed("pdo.event_timer", str(error))
@@ -263,12 +258,8 @@ def _check_event_timer(session: NodeSession, mapping: PdoMapping) -> None:
 
 def _remap(session: NodeSession, tpdo: NodeTpdo) -> list[tuple[bool, str]]:
     """Write a disabled TPDO's mapping again; return the refusals, each with True for a read-only one."""
-    index, name = cia301.TPDO_MAPPING + tpdo.number - 1, f"mapping of TPDO{tpdo.number}"
     try:
-        session.sdo.write_verified(index, 0, 0, 1, name)
-        for sub, entry in enumerate(tpdo.entries, 1):
-            session.sdo.write_verified(index, sub, entry, 4, name)
-        session.sdo.write_verified(index, 0, len(tpdo.entries), 1, name)
+        write_entries(session.sdo, tpdo.number, tpdo.entries)
     except BootStepError as error:
         code = getattr(error.__cause__, "code", None)
         return [(code in (0x06010000, 0x06010002), str(error))]
@@ -276,7 +267,7 @@ def _remap(session: NodeSession, tpdo: NodeTpdo) -> list[tuple[bool, str]]:
 
 
 def _as_enabled(tpdo: NodeTpdo) -> NodeTpdo:
-    return NodeTpdo(tpdo.number, tpdo.cob_id, True, tpdo.transmission_type, tpdo.entries, tpdo.no_rtr_bit)
+    return replace(tpdo, enabled=True)
 
 
 def _counts_of(cycles: Sequence[SyncCycle], mapping: PdoMapping) -> list[tuple[float, ...]]:

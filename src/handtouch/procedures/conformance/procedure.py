@@ -5,7 +5,6 @@ Public names: `run_checks`, `compare_serials`, `find_nodes`, `check_bus_is_free`
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
 from handtouch.canbus import cia301
@@ -20,16 +19,16 @@ from handtouch.procedures.conformance import (
 from handtouch.procedures.conformance.line import Line
 from handtouch.procedures.conformance.node_link import MS, NodeLink, is_from_master
 from handtouch.procedures.conformance.results import NodeReport
-from handtouch.procedures.conformance.session import (
-    ConformanceOptions,
-    NodeSession,
-    NodeUnderTest,
-    Operator,
-)
+from handtouch.procedures.conformance.session import ConformanceOptions, NodeSession, NodeUnderTest
+from handtouch.procedures.dialogue import Dialogue
 
 LISTEN_NS = 1000 * MS
 _PROBE_NS = 300 * MS
-_MASTER_NAMES = {cia301.NMT: "an NMT master", cia301.SYNC: "a SYNC producer", 0x7E5: "an LSS master"}
+_MASTER_NAMES = {
+    cia301.NMT: "an NMT master",
+    cia301.SYNC: "a SYNC producer",
+    cia301.LSS_REQUEST: "an LSS master",
+}
 
 
 class BusInUseError(Exception):
@@ -42,13 +41,13 @@ def check_bus_is_free(line: Line, name: str, listen_ns: int = LISTEN_NS) -> set[
     Raises BusInUseError if another master is active.
     """
     end_ns = line.now_ns() + listen_ns
-    found: Counter[str] = Counter()
+    found: set[int] = set()
     heard: set[int] = set()
     while (frame := line.receive(end_ns)) is not None:
         if 0 < frame[0] - cia301.NMT_ERROR_CONTROL < 128:
             heard.add(frame[0] - cia301.NMT_ERROR_CONTROL)
         if is_from_master(frame[0]):
-            found[_MASTER_NAMES.get(frame[0], f"an SDO client of node {frame[0] & 0x7F}")] += 1
+            found.add(frame[0])
         if frame[2] > end_ns:
             break
     if found:
@@ -76,7 +75,7 @@ def run_checks(
     node: NodeUnderTest,
     options: ConformanceOptions,
     progress: Callable[[str], None] = lambda _: None,
-    operator: Operator | None = None,
+    operator: Dialogue | None = None,
 ) -> NodeReport:
     """Test one node and set back what was changed.
 
@@ -95,10 +94,7 @@ def run_checks(
         progress("restoring")
         report.restore_problem = session.restore()
     if link.foreign:
-        names = Counter(
-            _MASTER_NAMES.get(can_id, f"an SDO client of node {can_id & 0x7F}") for can_id in link.foreign
-        )
-        raise BusInUseError(_describe_masters(node.bus, names))
+        raise BusInUseError(_describe_masters(node.bus, link.foreign))
     report.complete("an earlier check failed")
     return report
 
@@ -156,8 +152,10 @@ def _reset_node(session: NodeSession) -> None:
     network_checks.check_reset(session, "nmt.reset_node", cia301.RESET_NODE)
 
 
-def _describe_masters(bus: str, found: Counter[str]) -> str:
-    names = ", ".join(sorted(found))
+def _describe_masters(bus: str, found: set[int]) -> str:
+    names = ", ".join(
+        sorted({_MASTER_NAMES.get(can_id, f"an SDO client of node {can_id & 0x7F}") for can_id in found})
+    )
     return (
         f"{bus}: {names} is active on this bus; stop it first: the daemon (Ctrl-C, or systemctl stop "
         "handtouch), another master, a configuration tool"

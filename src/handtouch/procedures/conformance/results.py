@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any
 
-from handtouch.canbus.nodes.boot import Identity
+from handtouch.canbus.nodes.spec import Identity
 from handtouch.procedures.conformance.catalogue import CATALOGUE
 
 
@@ -82,9 +82,10 @@ class NodeReport:
             detail = f"{before.detail}; {detail}"
         self._results[_known(name)] = CheckResult(name, Verdict.FAILED, detail)
 
-    def not_tested(self, name: str, why: str) -> None:
-        """Record a check that was not made, unless it has a result."""
-        self._record(name, Verdict.NOT_TESTED, why)
+    def not_tested(self, why: str, *names: str) -> None:
+        """Record checks that were not made, unless they have a result."""
+        for name in names:
+            self._record(name, Verdict.NOT_TESTED, why)
 
     def assess(self, name: str, problems: list[str], detail: str = "") -> None:
         """Record a check that passes without problems."""
@@ -115,8 +116,7 @@ class NodeReport:
 
     def complete(self, why: str) -> None:
         """Mark all checks without a result as not tested."""
-        for name in CATALOGUE:
-            self.not_tested(name, why)
+        self.not_tested(why, *CATALOGUE)
 
     def to_map(self) -> dict[str, Any]:
         """Return the report as JSON values."""

@@ -1,21 +1,20 @@
 """The test of one node: what is tested, with which options, and restoring what it changes.
 
-Public names: `NodeUnderTest`, `ConformanceOptions`, `Operator`, `NodeSession`.
+Public names: `NodeUnderTest`, `ConformanceOptions`, `NodeSession`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from handtouch.canbus import cia301
-from handtouch.canbus.nodes.boot import ExpectedIdentity, IdleSettings
-from handtouch.canbus.objects.mapping import PdoMapping
+from handtouch.canbus.nodes.spec import NodeSpec
+from handtouch.canbus.objects.mapping import DEFAULT_TPDO_NUMBERS, PdoMapping
 from handtouch.canbus.objects.sdo import SDO_TIMEOUT_S, BootStepError, NodeSdoClient
-from handtouch.config.channels import STANDARD_CHANNELS, Channels, WritableObject
 from handtouch.procedures.conformance.node_link import MS, NodeLink
 from handtouch.procedures.conformance.results import NodeReport
+from handtouch.procedures.dialogue import Dialogue
 
 BOOT_TIMEOUT_NS = 3000 * MS
 _SETTLE_NS = 50 * MS
@@ -24,36 +23,15 @@ _GUARD_TIMEOUT_NS = 100 * MS
 _HEARTBEAT_WAIT_NS = 1100 * MS
 
 
-class Operator(Protocol):
-    """A person at the node, for the interactive steps."""
-
-    def prompt(self, text: str) -> None:
-        """Request an action."""
-
-    def has_skipped(self) -> bool:
-        """Return True once if the operator skips the present step."""
-
-
 @dataclass(frozen=True, slots=True)
-class NodeUnderTest:
-    """A node to test; what the deployment states about it, None where there is no deployment.
+class NodeUnderTest(NodeSpec):
+    """A node to test; without `name` where there is no deployment. `noise_counts`: expected noise of a
+    channel."""
 
-    `noise_counts`: expected noise of a channel; `eds`: path of its EDS.
-    """
-
-    bus: str
-    node_id: int
-    pad: str = ""
-    channels: Channels = STANDARD_CHANNELS
-    tpdo_numbers: tuple[int, ...] = (2, 1, 3, 4)
-    eds: str | None = None
-    excitation: WritableObject | None = None
-    expected: ExpectedIdentity = field(default_factory=ExpectedIdentity)
+    slot: int = field(default=0, kw_only=True)
+    name: str = field(default="", kw_only=True)
+    tpdo_numbers: tuple[int, ...] = DEFAULT_TPDO_NUMBERS
     noise_counts: float | None = None
-    allow_pdo_remapping: bool = True
-    heartbeat_ms: int = 100
-    idle: IdleSettings | None = None
-    event_timer_ms: int = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +55,14 @@ class RestoringSdoClient(NodeSdoClient):
 
     def __init__(self, transport: object) -> None:
         super().__init__(transport)  # type: ignore[arg-type]
-        self.originals: dict[tuple[int, int], tuple[int, int]] = {}
+        self.originals: dict[tuple[int, int], tuple[int, int | None]] = {}
+        """value and size, None for objects of CiA 301"""
 
-    def write_verified(self, index: int, sub: int, value: int, size: int, name: str) -> None:
-        """Write an object of `size` bytes and read it back."""
+    def write_verified(self, index: int, sub: int, value: int, name: str, size: int | None = None) -> None:
+        """Write an object and read it back."""
         if (index, sub) not in self.originals:
             self.originals[index, sub] = (self.read(index, sub, name), size)
-        super().write_verified(index, sub, value, size, name)
+        super().write_verified(index, sub, value, name, size)
 
 
 class NodeSession:
@@ -95,12 +74,12 @@ class NodeSession:
         node: NodeUnderTest,
         options: ConformanceOptions,
         progress: Callable[[str], None],
-        operator: Operator | None,
+        operator: Dialogue | None,
     ) -> None:
         self.link, self.node, self.options, self.operator = link, node, options, operator
         self.progress = progress
-        self.sdo = RestoringSdoClient(link.transport)
-        self.report = NodeReport(node.bus, node.node_id, node.pad)
+        self.sdo = RestoringSdoClient(link.client)
+        self.report = NodeReport(node.bus, node.node_id, node.name)
         self.mapping: PdoMapping | None = None
         self.has_heartbeat = self.is_guarded = False
         self._initial_state: int | None = None
@@ -147,7 +126,7 @@ class NodeSession:
         """Have the node send heartbeats, from which its initial NMT state is known."""
         try:
             self.sdo.write_verified(
-                cia301.HEARTBEAT_TIME, 0, self.node.heartbeat_ms, 2, "producer heartbeat time"
+                cia301.HEARTBEAT_TIME, 0, self.node.heartbeat_ms, "producer heartbeat time"
             )
         except BootStepError:
             self.has_heartbeat = False
@@ -180,7 +159,7 @@ class NodeSession:
         originals = dict(self.sdo.originals)
         cob_ids = {
             address: value
-            for address, value in originals.items()
+            for address, (value, _) in originals.items()
             if 0 <= address[0] - cia301.TPDO_COMMUNICATION < cia301.MAX_TPDOS and address[1] == 1
         }
         heartbeat = originals.pop((cia301.HEARTBEAT_TIME, 0), None)
@@ -191,14 +170,14 @@ class NodeSession:
             if address not in cob_ids and self.sdo.read(*address, "a setting") != value[0]
         }
         if any(index in pdo_range for index, _ in changed):
-            for (index, sub), (value, size) in cob_ids.items():
-                self.sdo.write_if_different(index, sub, value | cia301.INVALID_BIT, size, "COB-ID")
+            for (index, sub), cob_id in cob_ids.items():
+                self.sdo.write_if_different(index, sub, cob_id | cia301.INVALID_BIT, "COB-ID")
         for index, sub in changed:
             if index >= cia301.TPDO_MAPPING and index in pdo_range and sub:
-                self.sdo.write_if_different(index, 0, 0, 1, "number of mapped objects")
+                self.sdo.write_if_different(index, 0, 0, "number of mapped objects")
         for (index, sub), (value, size) in sorted(changed.items(), key=lambda item: not item[0][1]):
-            self.sdo.write_if_different(index, sub, value, size, "a setting")  # sub 0 comes last
-        for (index, sub), (value, size) in cob_ids.items():
-            self.sdo.write_if_different(index, sub, value, size, "COB-ID")
+            self.sdo.write_if_different(index, sub, value, "a setting", size)  # sub 0 comes last
+        for (index, sub), cob_id in cob_ids.items():
+            self.sdo.write_if_different(index, sub, cob_id, "COB-ID")
         if heartbeat is not None:
-            self.sdo.write_if_different(cia301.HEARTBEAT_TIME, 0, *heartbeat, "producer heartbeat time")
+            self.sdo.write_if_different(cia301.HEARTBEAT_TIME, 0, heartbeat[0], "producer heartbeat time")

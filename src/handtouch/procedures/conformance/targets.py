@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from handtouch import config
-from handtouch.canbus.nodes.boot import ExpectedIdentity
 from handtouch.canbus.nodes.spec import node_specs
 from handtouch.canbus.objects.mapping import tpdo_numbers
 from handtouch.config.channels import resolve_channels
@@ -102,20 +101,10 @@ def _nodes_of(deployment: config.Deployment, eds: str | None) -> dict[tuple[str,
             kind = deployment.nodes[pad.node]
             path = eds or kind.eds
             channels = resolve_channels(kind.channels, path)
+            same = {field.name: getattr(spec, field.name) for field in fields(spec)}
+            own = {"channels": channels, "eds": path, "channel_states": (), "sync_overflow": 0}
             nodes[spec.bus, spec.node_id] = NodeUnderTest(
-                spec.bus,
-                spec.node_id,
-                spec.name,
-                channels=channels,
-                tpdo_numbers=tpdo_numbers(path, channels),
-                eds=path,
-                excitation=spec.excitation,
-                expected=ExpectedIdentity(spec.vendor_id, spec.product_code, spec.revision, spec.serial),
-                noise_counts=kind.noise_counts,
-                allow_pdo_remapping=spec.allow_pdo_remapping,
-                heartbeat_ms=spec.heartbeat_ms,
-                idle=spec.idle,
-                event_timer_ms=spec.event_timer_ms,
+                **(same | own), tpdo_numbers=tpdo_numbers(path, channels), noise_counts=kind.noise_counts
             )
     except EdsError as error:
         raise _error("channels", "", str(error)) from error
