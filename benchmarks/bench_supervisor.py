@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.compressed_days import InlineSupervisor
 from benchmarks.page import made_by, options, output_folder, progress, table
 from benchmarks.soak_alarms import Hour
-from handtouch.canbus.nodes.master import SerialChanged
+from handtouch.canbus.nodes.spec import SerialChanged
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.supervisor_client import SupervisorClient

@@ -34,7 +34,7 @@ from benchmarks.page import progress
 from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
 from handtouch import wire
 from handtouch.calibration.store_client import StoreClient
-from handtouch.canbus.nodes.master import SerialChanged
+from handtouch.canbus.nodes.spec import SerialChanged
 from handtouch.config.files import deployment_files
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline

@@ -17,14 +17,8 @@ from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.router import CanFrame, Router
 from handtouch.canbus.nodes import master
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import (
-    ErrorChanged,
-    Master,
-    NodeEvent,
-    NodeSpec,
-    NodeStatus,
-    SerialChanged,
-)
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import ErrorChanged, NodeEvent, NodeSpec, NodeStatus, SerialChanged
 from handtouch.canbus.objects import sdo
 from handtouch.config import Bus
 from handtouch.core.slab import Slab

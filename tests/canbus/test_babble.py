@@ -16,7 +16,8 @@ from handtouch.canbus.nodes.lifecycle_types import (
     NodeTiming,
     SampleRate,
 )
-from handtouch.canbus.nodes.master import Master, NodeEvent, NodeSpec
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeEvent, NodeSpec
 from handtouch.config import Bus
 from handtouch.core.slab import Slab
 from handtouch.device import LineFaults

@@ -12,7 +12,8 @@ import pytest
 
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import Master, NodeSpec
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeSpec
 from handtouch.canbus.objects import sdo
 from handtouch.config import Bus
 from handtouch.core.slab import Slab

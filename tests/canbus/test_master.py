@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import Master, SerialChanged
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import SerialChanged
 from handtouch.config import shipped
 from handtouch.config.eds import EdsError
 

@@ -12,8 +12,7 @@ import pytest
 from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import SerialChanged
-from handtouch.canbus.nodes.spec import NodeEvent
+from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
 from handtouch.config import Behaviour
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline

@@ -14,7 +14,8 @@ from handtouch import wire
 from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.calibration.calibration import LawParameters
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import Master, SerialChanged
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import SerialChanged
 from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import SceneRequest

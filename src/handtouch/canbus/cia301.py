@@ -29,6 +29,8 @@ START_NODE, STOP_NODE, ENTER_PREOPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1
 
 # communication profile area
 DEVICE_TYPE = 0x1000
+DEVICE_TYPE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+"""SDO upload of the device type, which every node has."""
 ERROR_REGISTER = 0x1001
 ERROR_HISTORY = 0x1003
 """Pre-defined error field; sub-index 0: number of errors, 1: the latest."""
@@ -39,7 +41,13 @@ LIFE_TIME_FACTOR = 0x100D
 EMCY_COB_ID = 0x1014
 HEARTBEAT_TIME = 0x1017
 IDENTITY = 0x1018
-"""Sub-indices 1 to 4: vendor id, product code, revision, serial number."""
+IDENTITY_NAMES = {
+    "vendor_id": "vendor id",
+    "product_code": "product code",
+    "revision": "revision",
+    "serial": "serial number",
+}
+"""Fields of IDENTITY, sub-indices 1 to 4, with their names."""
 SERIAL_SUB = 4
 SYNC_OVERFLOW = 0x1019
 """Synchronous counter overflow value: SYNC carries a counter from 1 to it; 0: no counter."""

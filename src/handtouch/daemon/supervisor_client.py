@@ -15,12 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.calibration.calibration import LawParameters, LearnedParts, channel_values
-from handtouch.canbus.nodes.master import (
-    Master,
-    NodeEvent,
-    NodeState,
-    SerialChanged,
-)
+from handtouch.canbus.nodes.lifecycle_types import NodeState
+from handtouch.canbus.nodes.master import Master
+from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
 from handtouch.config import Deployment
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.events import (

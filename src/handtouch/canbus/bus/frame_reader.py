@@ -34,7 +34,7 @@ BATCH_FRAMES = 256
 """Most frames of a batch."""
 
 _SO_TIMESTAMPNS = 35
-_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
+CAN_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _WORD_BYTES = 8
 _VECTOR_WORD, _VECTORS_WORD, _CONTROL_WORD, _CONTROL_SIZE_WORD, _SIZE_WORD = 2, 3, 4, 5, 7
 """Words of a `struct mmsghdr`."""
@@ -99,7 +99,7 @@ class FrameReader:
 
     def frame(self, number: int) -> RawFrame:
         """Return a frame of the last batch."""
-        can_id, size, data = _FRAME.unpack_from(self._frame_bytes, number * _WORD_BYTES * FRAME_WORDS)
+        can_id, size, data = CAN_FRAME.unpack_from(self._frame_bytes, number * _WORD_BYTES * FRAME_WORDS)
         datagram_bytes = int(self._headers[number, _SIZE_WORD]) & 0xFFFFFFFF
         return RawFrame(can_id, size, data, datagram_bytes, frame_arrival_ns(self.batch, number))
 

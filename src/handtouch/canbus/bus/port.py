@@ -36,6 +36,7 @@ from handtouch.config import Bus
 from handtouch.core.slab import Slab
 from handtouch.host.machine import NoRouteError, check_multicast_route
 
+_SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 """Interfaces on which sent frames are received, and counted, again."""
 CABLELESS_INTERFACES = frozenset({"udp_multicast", "virtual"})
@@ -155,6 +156,14 @@ class Port:
         if receiver.fault is not None and receiver.fault.error_state is ErrorState.DOWN:
             receiver.fault = None  # on a silent bus no received frame would show that the interface is up
         return True
+
+    def send_patiently(self, can_id: int, data: bytes, remote: bool = False) -> bool:
+        """Send a frame as `send` does, repeated for up to 0.2 s while the queue is full."""
+        for _ in range(_SEND_ATTEMPTS):
+            if self.send(can_id, data, remote):
+                return True
+            time.sleep(_SEND_RETRY_S)
+        return False
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
         """Have the kernel send a frame now and every `period_s` seconds.

@@ -9,7 +9,6 @@ import errno
 import os
 import select
 import socket
-import struct
 import time
 from typing import Any, Self
 
@@ -19,6 +18,7 @@ from can.interfaces.udp_multicast.utils import unpack_message
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
 from handtouch.canbus.bus.frame_reader import (
     BATCH_FRAMES,
+    CAN_FRAME,
     FrameReader,
     PacketReader,
     RawFrame,
@@ -43,7 +43,6 @@ _MEMINFO_DROPS_INDEX = 8  # index among 32-bit words
 _DROPPED_PERIOD_NS = 50_000_000
 _DROPPED_FRAMES = 32
 """Dropped frames are counted that often, and whenever so many were waiting: only a full queue drops any."""
-_FRAME = struct.Struct("=IB3x8s")  # struct can_frame of <linux/can.h>
 _REMOTE_FLAG, _ERROR_FLAG, _IDENTIFIER_MASK = 0x40000000, 0x20000000, 0x1FFFFFFF
 
 
@@ -206,7 +205,7 @@ class SocketcanReceiver(_SocketReceiver):
         enable_stamps(self._socket)
 
     def _send(self, bus: can.BusABC, can_id: int, data: bytes, remote: bool) -> None:  # noqa: ARG002
-        frame = _FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
+        frame = CAN_FRAME.pack(can_id | _REMOTE_FLAG if remote else can_id, len(data), data)
         self._socket.send(frame, socket.MSG_DONTWAIT)
 
     def send_cyclically(self, can_id: int, data: bytes, period_s: float) -> CyclicSender | None:
@@ -227,7 +226,7 @@ def _accept_frames(reader: FrameReader, router: Router, first: int, end: int, ot
 def _accept_other(router: Router, frame: RawFrame, others: list[CanFrame]) -> None:
     """Count a frame that is no plain sample; append it to `others` if it is a data frame without a route."""
     can_id = frame.can_id
-    if frame.datagram_bytes != _FRAME.size or frame.size > 8:
+    if frame.datagram_bytes != CAN_FRAME.size or frame.size > 8:
         router.counters.unknown_frames += 1  # CAN FD
     elif can_id & _ERROR_FLAG:
         router.handle_error_frame(can_id & _IDENTIFIER_MASK, frame.data, frame.arrival_ns)

@@ -35,7 +35,6 @@ MAX_READERS = 16
 _DRIVES = 402  # profile of drives and motion control, in the device type
 _MAX_MISSING_TPDOS = 4  # consecutive missing TPDOs that end the search
 _REQUEST_BITS = 135
-_MAX_SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002  # while the transmit queue is full
 _IDENTITY_OBJECTS = frozenset({(cia301.DEVICE_TYPE, 0), *((cia301.IDENTITY, sub) for sub in (1, 2, 3, 4))})
 _SDO_FRAME = struct.Struct("<BHB4s")
 
@@ -127,9 +126,7 @@ class BusSurvey:
         for probed in (ids, [node_id for node_id in ids if node_id in detected]):
             silent = [node_id for node_id in probed if node_id not in self._responding_ids]
             for node_id in silent:
-                self._send(
-                    cia301.SDO_REQUEST + node_id, _SDO_FRAME.pack(0x40, cia301.DEVICE_TYPE, 0, bytes(4))
-                )
+                self.port.send_patiently(cia301.SDO_REQUEST + node_id, cia301.DEVICE_TYPE_REQUEST)
             queued_s = len(silent) * _REQUEST_BITS / self.port.bus.bitrate_bit_s
             if silent:
                 self.receive(RESPONSE_TIMEOUT_S + queued_s, lambda: self._responding_ids >= set(ids))
@@ -141,7 +138,7 @@ class BusSurvey:
         """Read the nodes with these ids; `progress` is called with the number read so far."""
         if not ids:
             return []
-        self._readers = {node_id: SdoTransport(node_id, self._send) for node_id in ids}
+        self._readers = {node_id: SdoTransport(node_id, self.port.send_patiently) for node_id in ids}
         with ThreadPoolExecutor(MAX_READERS, "sdo") as pool:
             jobs = [
                 pool.submit(_read_node, node_id, NodeSdoClient(transport))
@@ -165,7 +162,7 @@ class BusSurvey:
         if request is not None:
             self.receive(0.0)
             self._lss_responses.clear()
-            self._send(cia301.LSS_REQUEST, request)
+            self.port.send_patiently(cia301.LSS_REQUEST, request)
         self.receive(timeout_s, lambda: bool(self._lss_responses))
         return self._lss_responses.popleft() if self._lss_responses else None
 
@@ -190,13 +187,6 @@ class BusSurvey:
         if command & 0xE0 == 0x40 and (index, sub) in _IDENTITY_OBJECTS:
             self._identity_values.setdefault(node_id, {}).setdefault((index, sub), set()).add(value)
 
-    def _send(self, can_id: int, data: bytes) -> bool:
-        for _ in range(_MAX_SEND_ATTEMPTS):
-            if self.port.send(can_id, data):
-                return True
-            time.sleep(_SEND_RETRY_S)
-        return False
-
     def _merge_traffic(self, facts: dict[str, object]) -> NodeFacts:
         """Add a node's observed traffic to the data read from it."""
         node_id = facts["node_id"]
@@ -216,11 +206,11 @@ class BusSurvey:
 
     def _describe_conflict(self, node_id: int) -> str:
         """Return evidence of two nodes with this id: different responses for a constant object."""
-        names = {0: "device types", 1: "vendor ids", 2: "product codes", 3: "revisions", 4: "serial numbers"}
+        names = ("device type", *cia301.IDENTITY_NAMES.values())
         for (_, sub), values in sorted(self._identity_values.get(node_id, {}).items(), reverse=True):
             if len(values) > 1:
                 numbers = sorted(int.from_bytes(value, "little") for value in values)
-                return f"duplicate node id: {names[sub]} {' and '.join(map(str, numbers))}"
+                return f"duplicate node id: {names[sub]}s {' and '.join(map(str, numbers))}"
         return ""
 
 
@@ -301,7 +291,7 @@ def _read_node(node_id: int, sdo: NodeSdoClient) -> dict[str, object]:
 def _read_identity(sdo: NodeSdoClient, facts: dict[str, object]) -> None:
     """Read 0x1018 into `facts`; fields that the node refuses are in `refused`."""
     facts["refused"] = refused = dict[str, str]()
-    for sub, name in enumerate(("vendor_id", "product_code", "revision", "serial"), 1):
+    for sub, name in enumerate(cia301.IDENTITY_NAMES, 1):
         try:
             facts[name] = sdo.read(cia301.IDENTITY, sub, name) & 0xFFFFFFFF
         except BootStepError as error:
@@ -336,22 +326,12 @@ def _read_tpdos(sdo: NodeSdoClient) -> Iterator[TpdoFacts]:
 
 def _read_integer(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
     """Read an object, limited to 32 bits; None if the node refuses."""
-    value = _read_object(sdo, index, sub)
+    value = sdo.read_or_none(index, sub, "an object")
     return None if value is None else value & 0xFFFFFFFF
-
-
-def _read_object(sdo: NodeSdoClient, index: int, sub: int) -> int | None:
-    """Read an object of any length; None if the node refuses. Raises BootStepError for no valid response."""
-    try:
-        return sdo.read(index, sub, "an object")
-    except BootStepError as error:
-        if not isinstance(error.__cause__, SdoAbortedError):
-            raise
-        return None
 
 
 def _read_string(sdo: NodeSdoClient, index: int) -> str:
     """Read a string object, made printable; empty if the node doesn't have it."""
-    value = _read_object(sdo, index, 0) or 0
+    value = sdo.read_or_none(index, 0, "an object") or 0
     data = value.to_bytes((value.bit_length() + 7) // 8, "little")
     return "".join(c if c.isprintable() else " " for c in data.decode("utf-8", "replace")).strip()[:80]

@@ -57,12 +57,9 @@ class NodeConfigured:
 
 def read_identity(sdo: NodeSdoClient) -> Identity:
     """Read 0x1018."""
-    return Identity(
-        sdo.read(cia301.IDENTITY, 1, "vendor id"),
-        sdo.read_if_present(cia301.IDENTITY, 2, "product code"),
-        sdo.read_if_present(cia301.IDENTITY, 3, "revision"),
-        sdo.read_if_present(cia301.IDENTITY, 4, "serial number"),
-    )
+    first, *further = cia301.IDENTITY_NAMES.values()
+    optional = (sdo.read_if_present(cia301.IDENTITY, sub, name) for sub, name in enumerate(further, 2))
+    return Identity(sdo.read(cia301.IDENTITY, 1, first), *optional)
 
 
 def identify_node(sdo: NodeSdoClient) -> Identification:
@@ -73,16 +70,9 @@ def identify_node(sdo: NodeSdoClient) -> Identification:
 def check_identity(identity: Identity, expected: NodeSpec) -> None:
     """Raise BootStepError unless a node is the expected one, and none of another pad."""
     owner = expected.serials_of_other_pads.get(identity.serial or 0)
-    for sub, (name, key, actual, configured) in enumerate(
-        (
-            ("vendor id", "vendor_id", identity.vendor_id, expected.vendor_id),
-            ("product code", "product_code", identity.product_code, expected.product_code),
-            ("revision", "revision", identity.revision, expected.revision),
-            ("serial number", "serial", identity.serial, None if owner else expected.serial),
-        ),
-        1,
-    ):
-        if configured is not None and actual != configured:
+    for sub, (key, name) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
+        actual, configured = getattr(identity, key), getattr(expected, key)
+        if configured is not None and actual != configured and not (owner and key == "serial"):
             refused = f"none, as 0x1018:{sub:02} is refused by the node or unanswered"
             value = refused if actual is None else f"{actual} (0x{actual:X})"
             raise BootStepError(

@@ -1,8 +1,8 @@
 """CANopen master of a hand's nodes: boots, supervises and recovers each of them.
 
-Public names: `Master`, `NodeSpec`, `NodeState`, `NodeStatus`, and the events that it reports. One thread
-receives and calls `handle_frame` and `poll`; steps that wait for a node's response run in worker threads, so
-that a silent node doesn't delay the others. Nodes are addressed one by one, never by a broadcast.
+Public name: `Master`. One thread receives and calls `handle_frame` and `poll`; steps that wait for a node's
+response run in worker threads, so that a silent node doesn't delay the others. Nodes are addressed one by
+one, never by a broadcast.
 """
 
 from __future__ import annotations
@@ -62,21 +62,11 @@ from handtouch.canbus.nodes.spec import (
     NodeStatus,
     SerialChanged,
 )
+from handtouch.canbus.nodes.transitions import NEVER_NS, STARTED
 from handtouch.canbus.objects.emergency import ReportedErrors, decode_emergency
 from handtouch.canbus.objects.mapping import PdoMapping
 from handtouch.wire.emergency import Emergency
 from handtouch.wire.status import MAX_SILENT_PERIODS
-
-__all__ = [
-    "ErrorChanged",
-    "Master",
-    "MasterEvent",
-    "NodeEvent",
-    "NodeSpec",
-    "NodeState",
-    "NodeStatus",
-    "SerialChanged",
-]
 
 _MIN_STALE_NS = 15_000_000
 """Shortest time until stale: at 1 kHz three periods may be a pause of this process, without a SYNC."""
@@ -87,16 +77,10 @@ MIN_DOUBLED_WINDOWS = 2
 _MIN_DOUBLED_RATIO = 1.6
 _MAX_WORKERS = 32
 _MAX_EVENTS = 1024
-_NEVER_NS = 1 << 62
 _REQUEST_TIMEOUT_NS = 30_000_000
 """Timeout of a request sent by the receiving thread itself."""
 _NMT_BYTES = 2
 _SDO_WRITTEN, _SDO_REFUSED = 0x60, 0x80
-
-_PROBE_REQUEST = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
-"""SDO upload of the device type, 0x1000, which every node has."""
-
-_STARTED_STATES = (NodeState.SETTLING, NodeState.OPERATIONAL, NodeState.STALE)
 
 
 class Master:
@@ -218,7 +202,7 @@ class Master:
         `self.idle` shows the change. All other requests are sent by a worker.
         """
         node = self._by_slot[slot]
-        allowed = self.can_idle(slot) if idle else node.lifecycle.state in _STARTED_STATES
+        allowed = self.can_idle(slot) if idle else node.lifecycle.state in STARTED
         if self._workers is None or node.idle == idle or not allowed:
             return
         unanswered = node.request_ns and now_ns - node.request_ns > _REQUEST_TIMEOUT_NS
@@ -367,7 +351,7 @@ class Master:
                         self._advance(node, BusRecovered(), now_ns)
 
     def _run_timers(self, now_ns: int) -> None:
-        self._next_due_ns = _NEVER_NS
+        self._next_due_ns = NEVER_NS
         for node in self._nodes:
             self._take_over_pauses(node, now_ns)
             due = due_ns(node.lifecycle, node.timing)
@@ -428,7 +412,7 @@ class Master:
         if action in NMT_COMMANDS:
             send_nmt(node, action)
         elif action is NodeAction.PROBE:
-            node.port.send(cia301.SDO_REQUEST + node.spec.node_id, _PROBE_REQUEST)
+            node.port.send(cia301.SDO_REQUEST + node.spec.node_id, cia301.DEVICE_TYPE_REQUEST)
             # a stopped node serves no SDO; one without heartbeat reports its state only when guarded
             node.port.send(cia301.NMT_ERROR_CONTROL + node.spec.node_id, b"", remote=True)
         elif self._workers is not None:
@@ -535,7 +519,7 @@ class Master:
                     f"COB-ID 0x{cob_id:X} of its samples is also that of {two.spec.name}; "
                     "give one of them another COB-ID and store it"
                 )
-                if one is node or one.lifecycle.state in _STARTED_STATES:  # others read their own again
+                if one is node or one.lifecycle.state in STARTED:  # others read their own again
                     self._advance(one, IdentifierClash(reason), now_ns)
         if others:
             return True

@@ -13,8 +13,6 @@ from typing import Protocol
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.router import CanFrame
 
-_SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002  # while the transmit queue is full
-
 
 class Line(Protocol):
     """A bus and its time [ns]."""
@@ -51,10 +49,7 @@ class PortLine:
 
     def send(self, can_id: int, data: bytes = b"", remote: bool = False) -> None:
         """Send a frame; retried while the transmit queue is full."""
-        for _ in range(_SEND_ATTEMPTS):
-            if self.port.send(can_id, data, remote):
-                return
-            time.sleep(_SEND_RETRY_S)
+        self.port.send_patiently(can_id, data, remote)
 
     def receive(self, until_ns: int) -> CanFrame | None:
         """Wait for the next frame."""

@@ -151,7 +151,7 @@ class NodeLink:
         """Return the highest node id that no node responds to."""
         for node_id in range(127, 0, -1):
             if node_id != self.node_id:
-                self._line.send(cia301.SDO_REQUEST + node_id, b"\x40\x00\x10" + bytes(5))
+                self._line.send(cia301.SDO_REQUEST + node_id, cia301.DEVICE_TYPE_REQUEST)
                 self.wait(_PROBE_NS, lambda node_id=node_id: node_id in self.other_nodes)  # type: ignore[misc]
                 if node_id not in self.other_nodes:
                     return node_id
@@ -161,8 +161,7 @@ class NodeLink:
         """Request the device type once; return True if there is any response."""
         self._drain()
         self._responses.clear()
-        request = b"\x40" + cia301.DEVICE_TYPE.to_bytes(2, "little") + bytes(5)
-        self._line.send(cia301.SDO_REQUEST + self.node_id, request)
+        self._line.send(cia301.SDO_REQUEST + self.node_id, cia301.DEVICE_TYPE_REQUEST)
         answered = self.wait(timeout_ns, lambda: bool(self._responses))
         self._responses.clear()
         return answered

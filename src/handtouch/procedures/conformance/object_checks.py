@@ -22,7 +22,6 @@ _LENGTH_CODES = frozenset({0x06070010, 0x06070012, 0x06070013})
 _ABSENT_INDICES = (0x5FFE, 0x1F00, 0x9FFE)
 """Indices that hardly any node has."""
 _CHANGED_HEARTBEAT_MS = 250
-_IDENTITY_TYPES = ("vendor_id", "product_code", "revision", "serial")
 _MAX_PROBLEMS = 8
 
 
@@ -53,11 +52,11 @@ def check_identity_object(session: NodeSession) -> None:
         report.failed("identity.read", str(error))
         return
     report.identity = first
-    missing = [name for name in _IDENTITY_TYPES if getattr(first, name) is None]
+    missing = [name for key, name in cia301.IDENTITY_NAMES.items() if getattr(first, key) is None]
     if first != second:
         report.failed("identity.read", f"read {first}, then {second}: two nodes with this id?")
     elif missing:
-        report.failed("identity.read", f"no {', '.join(missing).replace('_', ' ')}")
+        report.failed("identity.read", f"no {', '.join(missing)}")
     else:
         report.passed("identity.read", f"vendor 0x{first.vendor_id:X}, product 0x{first.product_code:X}")
     if not first.serial:

@@ -59,7 +59,7 @@ def find_nodes(line: Line, ids: Iterable[int] = range(1, 128)) -> list[int]:
     """Return the node ids that respond to a request for 0x1000, with its value or an abort."""
     requested = set(ids)
     for node_id in sorted(requested):
-        line.send(cia301.SDO_REQUEST + node_id, b"\x40\x00\x10" + bytes(5))
+        line.send(cia301.SDO_REQUEST + node_id, cia301.DEVICE_TYPE_REQUEST)
     found: set[int] = set()
     end_ns = line.now_ns() + _PROBE_NS
     while found < requested and (frame := line.receive(end_ns)) is not None:

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from handtouch import config
+from handtouch.canbus import cia301
 from handtouch.canbus.find.survey import NodeFacts
 from handtouch.config import channels
 from handtouch.procedures.scan.bus_scan import BusReport
@@ -99,12 +100,8 @@ def _names_by_serial(deployment: config.Deployment | None) -> dict[int, str]:
 
 def _describe_mismatch(node: NodeFacts, pad: config.Pad, kind: config.Node) -> str:
     """Describe in what a node differs from its configuration; empty if it doesn't."""
-    for sub, quantity, key, found, configured in (
-        (1, "vendor id", "vendor_id", node.vendor_id, kind.vendor_id),
-        (2, "product code", "product_code", node.product_code, kind.product_code),
-        (3, "revision", "revision", node.revision, kind.revision),
-        (4, "serial number", "serial", node.serial, pad.serial),
-    ):
+    for sub, (key, quantity) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
+        found, configured = getattr(node, key), getattr(pad if key == "serial" else kind, key)
         if configured is None or found == configured:
             continue
         if found is None:
