@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,6 @@ ChannelValues = Annotated[tuple[float, ...], Field(min_length=MIN_CHANNELS, max_
 Matrix = tuple[tuple[float, ...], ...]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-
-Record = TypeVar("Record")
 
 _RECORD = ConfigDict(
     extra="forbid", strict=True, allow_inf_nan=False, ser_json_bytes="base64", val_json_bytes="base64"
@@ -152,16 +150,6 @@ class Calibration:
     law: LawParameters | None = None
     sheet: StoredSheetState | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the known parts, ready for `json.dumps`; numbers keep all their digits."""
-        record: dict[str, Any] = _CALIBRATION.dump_python(self, mode="json", exclude_none=True)
-        return record
-
-    @classmethod
-    def from_json(cls, record: object) -> Calibration:
-        """Return the calibration in a record of `to_json`. Raises ValueError naming the wrong key."""
-        return _validate(_CALIBRATION, record, "calibration")
-
 
 @dataclass(frozen=True, config=_RECORD)
 class Provenance:
@@ -182,16 +170,6 @@ class Provenance:
     note: str = ""
     foreign: str = ""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return a record ready for `json.dumps`, without a NaN."""
-        record: dict[str, Any] = _PROVENANCE.dump_python(self)
-        return {name: value for name, value in record.items() if value == value}
-
-    @classmethod
-    def from_json(cls, record: object) -> Provenance:
-        """Return the provenance in a record of `to_json`. Raises ValueError naming the wrong key."""
-        return _validate(_PROVENANCE, record, "provenance")
-
 
 @dataclass(frozen=True, config=_RECORD)
 class CalibrationVersion:
@@ -210,47 +188,34 @@ class CalibrationVersion:
         return f"{self.serial}-{self.number}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return a record ready for `json.dumps`, the sheet's state as base64."""
+        """Return a record ready for `json.dumps`: known parts, all digits, the sheet's state as base64."""
         record: dict[str, Any] = _VERSION.dump_python(self, mode="json", exclude_none=True)
-        return record | {"provenance": self.provenance.to_json()}
+        if math.isnan(self.provenance.residual):
+            del record["provenance"]["residual"]
+        return record
 
     @classmethod
     def from_json(cls, record: object) -> CalibrationVersion:
         """Return the version in a record of `to_json`. Raises ValueError naming the wrong key."""
-        return _validate(_VERSION, record, "version")
+        try:
+            return _VERSION.validate_json(json.dumps(record))
+        except ValidationError as error:
+            problem = error.errors(include_url=False)[0]
+            key = ".".join(map(str, ("version", *problem["loc"])))
+            text = _PROBLEMS.get(problem["type"], problem["msg"].replace("Input should be", "must be"))
+            raise ValueError(f"{key}: {text}") from error
 
 
-_CALIBRATION: TypeAdapter[Calibration] = TypeAdapter(Calibration)
-_PROVENANCE: TypeAdapter[Provenance] = TypeAdapter(Provenance)
 _VERSION: TypeAdapter[CalibrationVersion] = TypeAdapter(CalibrationVersion)
 _PROBLEMS = {"unexpected_keyword_argument": "unknown key", "missing": "missing key"}
 
 
-def _validate(adapter: TypeAdapter[Record], record: object, name: str) -> Record:
-    try:
-        return adapter.validate_json(json.dumps(record))
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = ".".join(map(str, (name, *problem["loc"])))
-        text = _PROBLEMS.get(problem["type"], problem["msg"].replace("Input should be", "must be"))
-        raise ValueError(f"{key}: {text}") from error
-
-
-@dataclass(frozen=True)
-class MatchedCalibration:
-    """A version to apply. mismatch: reason why it isn't this node's own; empty if it is."""
-
-    version: CalibrationVersion
-    mismatch: str
-
-
 def check_match(
     version: CalibrationVersion, serial: int, config: str, *, accept_mismatch: bool = False
-) -> MatchedCalibration:
-    """Match a version with the node `serial` under the tables `config`.
+) -> str:
+    """Return why a version isn't the node `serial`'s own under the tables `config`, empty if it is.
 
-    Raises MismatchError if it is another node's, or was made under other tables, unless that is accepted;
-    then the result states it.
+    Raises MismatchError if it isn't, unless that is accepted.
     """
     mismatches = [version.provenance.foreign] if version.provenance.foreign else []
     if version.serial != serial:
@@ -263,7 +228,7 @@ def check_match(
             f"version {version.number} of serial {version.serial} doesn't match: {mismatch}; "
             "calibrate this node, or accept the mismatch explicitly"
         )
-    return MatchedCalibration(version, mismatch)
+    return mismatch
 
 
 def age_s(version: CalibrationVersion, now: datetime) -> float:

@@ -80,7 +80,7 @@ def import_versions(
     if serial is not None and len(found) != 1:
         raise StoreError(f"{file}: holds {len(found)} calibrations: --serial needs a file of one")
     try:
-        matched = [
+        mismatches = [
             check_match(v, v.serial if serial is None else serial, v.config, accept_mismatch=accept_mismatch)
             for v in found
         ]
@@ -88,7 +88,7 @@ def import_versions(
         raise StoreError(f"{file}: {error}, by --other-sensor") from error
     local = _local_provenance(f"imported from {file.name}")
     written = []
-    for version, mismatch in ((one.version, one.mismatch) for one in matched):
+    for version, mismatch in zip(found, mismatches, strict=True):
         origin = replace(
             version.provenance, host=local.host, program=local.program, note=local.note, foreign=mismatch
         )
