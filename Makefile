@@ -93,7 +93,7 @@ docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are error
 
 tables: $(VENV)/.dev ## write docs/configuration.md, docs/wire.schema.json and the tables of wire.md and firmware.md from the code
 	$(BIN)/python -m handtouch.wire.tables docs
-	$(BIN)/python -m handtouch.procedures.conformance.page docs
+	$(BIN)/python docs/firmware_tables.py
 	@mkdir -p build
 	$(BIN)/python docs/configuration_page.py >build/configuration.md && mv build/configuration.md docs/configuration.md
 

@@ -229,7 +229,8 @@ def test_calibration_scales_and_shifts_currents(served: Bench) -> None:
     amperes = served.deployment.nodes["n"].full_scale_ma * 1e-3 / 32767
     expected = (2 * 100 + 3 * 200) * amperes
     assert served.pipeline.tick.columns.total_current_a[0] == pytest.approx(expected, abs=10 * amperes)
-    assert model.calibration_ids[:2] == ["c1", model.default_calibration_ids[1]]
+    ids = [calibration.calibration_id for calibration in model.calibrations]
+    assert ids[:2] == ["c1", model.default_calibration_ids[1]]
 
 
 def test_status_lists_computed_outputs_and_their_requesters(served: Bench) -> None:
@@ -277,7 +278,7 @@ def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
     assert served.pipeline.tick.model is model
     assert model.calibrations[1].calibration_id == "c1"
     assert (served.pipeline.tick.baseline.expected_counts[1] > 1.0).all()  # it tracks the readings of 0
-    assert model.calibration_ids[0] == model.default_calibration_ids[0]
+    assert model.calibrations[0].calibration_id == model.default_calibration_ids[0]
     assert int(served.pipeline.tick.contacts.id[0]) == contact
     assert model.begin_threshold_a[0] != 0
     assert served.ask("reload")["tables"] == []  # the new file is applied already

@@ -213,7 +213,8 @@ def test_invalid_message_is_counted_and_changes_nothing(
     rig.receive(message)
     assert rig.supervisor.statistics()[counter] == 1
     assert (rig.pipeline.model.gains == 1).all()
-    assert rig.pipeline.model.calibration_ids == rig.pipeline.model.default_calibration_ids
+    model = rig.pipeline.model
+    assert [c.calibration_id for c in model.calibrations] == model.default_calibration_ids
 
 
 def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
@@ -223,7 +224,7 @@ def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
     model = rig.pipeline.model
     assert model.quarantined.tolist() == [True, False, False]
     assert model.gains[0].tolist() == [1.0] * 4
-    assert model.calibration_ids[0] == model.default_calibration_ids[0]
+    assert model.calibrations[0].calibration_id == model.default_calibration_ids[0]
     assert rig.supervisor.health_fields(0)["calibration_state"] == "quarantined"
     rig.receive(calibrate(0, 11))  # about the previous node
     assert rig.supervisor.late == 1

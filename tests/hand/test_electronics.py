@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.firmware_tables import BANDWIDTH_HZ, error_rows, feedback_ohm, location_shift_m
 from handtouch import config
 from handtouch.canbus.bus.load import burst_s, frame_bits
 from handtouch.config import shipped
-from handtouch.hand.electronics import BANDWIDTH_HZ, error_rows, feedback_ohm, location_shift_m
 from handtouch.hand.expected_error import PadDesign, expected_error, pad_design
 
 PAGE = Path(__file__).parents[2] / "docs" / "firmware.md"

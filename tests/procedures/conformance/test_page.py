@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
+from docs.firmware_tables import with_tables
 from handtouch.procedures.conformance import NodeReport
-from handtouch.procedures.conformance.page import with_tables
 from tests.minimal_node import minimal_eds
 from tests.procedures.conformance.test_faults import CASES, NOT_ON_THE_BUS
 

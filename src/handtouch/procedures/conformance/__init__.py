@@ -14,7 +14,7 @@ from handtouch.procedures.conformance.procedure import (
     find_nodes,
     run_checks,
 )
-from handtouch.procedures.conformance.required_objects import REQUIRED_OBJECTS, table_rows
+from handtouch.procedures.conformance.required_objects import REQUIRED_OBJECTS
 from handtouch.procedures.conformance.results import (
     CheckResult,
     NodeReport,
@@ -45,5 +45,4 @@ __all__ = [
     "find_nodes",
     "run_checks",
     "select_targets",
-    "table_rows",
 ]

@@ -1,11 +1,10 @@
 """Objects that a node needs: the table of docs/firmware.md.
 
-Public names: `RequiredObject`, `REQUIRED_OBJECTS`, `table_rows`.
+Public names: `RequiredObject`, `REQUIRED_OBJECTS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -126,14 +125,3 @@ REQUIRED_OBJECTS = (
         optional=True,
     ),
 )
-
-
-def table_rows() -> Iterator[str]:
-    """Yield the rows of the table in docs/firmware.md."""
-    yield "| object | type | access | value after power-on | |"
-    yield "|---|---|---|---|---|"
-    for row in REQUIRED_OBJECTS:
-        subs = f"{row.index:04X}:00" + (f" to :{row.last_sub:02d}" if row.last_sub else "")
-        remark = f"optional: {row.remark}" if row.optional else row.remark
-        types, defaults = ", ".join(row.types), ", ".join(row.defaults)
-        yield f"| 0x{subs} {row.name} | {types} | {row.access} | {defaults} | {remark} |"

@@ -1,22 +1,36 @@
-"""Currents of a pad, and what each part of its electronics costs in position: tables of docs/firmware.md.
+"""Tables of docs/firmware.md; `make tables` writes them. The page marks each by `<!-- table: NAME -->`.
 
-Public names: `current_rows`, `error_rows`, `feedback_ohm`, `location_shift_m`.
-
-Random errors are per channel and sample; their effect is the Cramer-Rao bound, median over the inner 80 % of
-the pad. Systematic errors shift the location, to first order; those of the four channels are independent, and
-their effect is the standard deviation, median over the pad.
+Currents of a pad, and what each part of its electronics costs in position: random errors are per channel and
+sample; their effect is the Cramer-Rao bound, median over the inner 80 % of the pad. Systematic errors shift
+the location, to first order; those of the four channels are independent, and their effect is the standard
+deviation, median over the pad.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.hand.expected_error import EDGE_MARGIN, FIRM_TOUCH_N, PadDesign, error_summary, expected_error
+from handtouch import config
+from handtouch.config import shipped
+from handtouch.hand.expected_error import (
+    EDGE_MARGIN,
+    FIRM_TOUCH_N,
+    PadDesign,
+    error_summary,
+    expected_error,
+    pad_design,
+)
+from handtouch.procedures.conformance import CATALOGUE, REQUIRED_OBJECTS
 
+PAGE = Path(__file__).with_name("firmware.md")
+_TABLE = re.compile(r"(?<=<!-- table: )(objects|checks|currents|electronics)( -->\n)(?:\|.*\n)*")
+_CONFIG = "utah_mit.toml"
 FloatArray = npt.NDArray[np.float64]
 CurrentErrors = Callable[[FloatArray], FloatArray]
 """Currents (4, ...) -> errors of them (k, 4, ...) in k cases [A]."""
@@ -139,3 +153,61 @@ def _format_current(current_a: float, step_a: float) -> str:
 def _format_length(length_m: float) -> str:
     micrometres = 1e6 * length_m
     return f"{micrometres / 1e3:.2g} mm" if micrometres >= 100 else f"{micrometres:.2g} um"
+
+
+def with_tables(page: str) -> str:
+    """Return a page with all marked tables; that of the faults, which tests write, is left."""
+    return _TABLE.sub(
+        lambda mark: mark[1] + mark[2] + "".join(f"{row}\n" for row in _TABLES[mark[1]]()), page
+    )
+
+
+def _objects() -> Iterator[str]:
+    yield "| object | type | access | value after power-on | |"
+    yield "|---|---|---|---|---|"
+    for row in REQUIRED_OBJECTS:
+        subs = f"{row.index:04X}:00" + (f" to :{row.last_sub:02d}" if row.last_sub else "")
+        remark = f"optional: {row.remark}" if row.optional else row.remark
+        types, defaults = ", ".join(row.types), ", ".join(row.defaults)
+        yield f"| 0x{subs} {row.name} | {types} | {row.access} | {defaults} | {remark} |"
+
+
+def _checks() -> Iterator[str]:
+    yield from _head("check", "tests", "remedy")
+    yield from (f"| `{check.name}` | {check.tests} | {check.remedy} |" for check in CATALOGUE.values())
+
+
+def _currents() -> Iterator[str]:
+    yield from _head("force", "total", "one electrode, anywhere on the inner 80 %", "counts")
+    yield from _rows(current_rows(_pad()))
+
+
+def _electronics() -> Iterator[str]:
+    pad = _pad()
+    yield from _head("source", "in a channel", f"at {pad.light_touch_n:g} N", f"at {FIRM_TOUCH_N:g} N")
+    yield from _rows(error_rows(pad))
+
+
+def _pad() -> PadDesign:
+    return pad_design(config.load(shipped.path(_CONFIG)))
+
+
+def _head(*titles: str) -> Iterator[str]:
+    yield f"| {' | '.join(titles)} |"
+    yield "|---" * len(titles) + "|"
+
+
+def _rows(rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
+    yield from (f"| {' | '.join(cells)} |" for cells in rows)
+
+
+_TABLES: dict[str, Callable[[], Iterator[str]]] = {
+    "objects": _objects,
+    "checks": _checks,
+    "currents": _currents,
+    "electronics": _electronics,
+}
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
