@@ -33,30 +33,30 @@ CURRENTS = tuple((0x6401, sub, 16) for sub in (1, 2, 3, 4))
 STATUS, DUMMY_8, DUMMY_16 = (0x2000, 0, 8), (0x0005, 0, 8), (0x0006, 0, 16)
 CARRIED = {
     "feldmann-ai4w.eds": (
-        TpdoDefault(1, 0x185, True, 255, ((0x6000, 1, 8),), True),
-        TpdoDefault(2, 0x285, True, 255, CURRENTS, True),
+        TpdoDefault(1, 0x185, True, 255, ((0x6000, 1, 8),)),
+        TpdoDefault(2, 0x285, True, 255, CURRENTS),
     ),
     "norsens-quad404.eds": (
-        TpdoDefault(1, 0x185, True, 1, ((0x9130, 1, 32), (0x9130, 2, 32)), True),
-        TpdoDefault(2, 0x285, True, 1, ((0x9130, 3, 32), (0x9130, 4, 32)), True),
+        TpdoDefault(1, 0x185, True, 1, ((0x9130, 1, 32), (0x9130, 2, 32))),
+        TpdoDefault(2, 0x285, True, 1, ((0x9130, 3, 32), (0x9130, 4, 32))),
     ),
     "tactor-q16.eds": (
-        TpdoDefault(1, 0x185, True, 1, (STATUS, (0x2110, 0, 16), DUMMY_8, (0x2120, 0, 16)), False),
-        TpdoDefault(3, 0x385, True, 1, ((0x2130, 0, 16), (0x2001, 0, 8), DUMMY_16, (0x2140, 0, 16)), False),
+        TpdoDefault(1, 0x185, True, 1, (STATUS, (0x2110, 0, 16), DUMMY_8, (0x2120, 0, 16))),
+        TpdoDefault(3, 0x385, True, 1, ((0x2130, 0, 16), (0x2001, 0, 8), DUMMY_16, (0x2140, 0, 16))),
     ),
     "hapt24.dcf": (
-        TpdoDefault(1, 0x185, True, 1, ((0x8130, 1, 24), (0x8130, 2, 24), (0x6150, 1, 8)), True),
-        TpdoDefault(2, 0x285, True, 1, ((0x8130, 3, 24), (0x8130, 4, 24)), True),
-        TpdoDefault(3, 0x385, False, 254, ((0x6130, 1, 32), (0x6130, 2, 32)), True),
+        TpdoDefault(1, 0x185, True, 1, ((0x8130, 1, 24), (0x8130, 2, 24), (0x6150, 1, 8))),
+        TpdoDefault(2, 0x285, True, 1, ((0x8130, 3, 24), (0x8130, 4, 24))),
+        TpdoDefault(3, 0x385, False, 254, ((0x6130, 1, 32), (0x6130, 2, 32))),
     ),
-    "noname-4ch.eds": (TpdoDefault(1, 0x185, True, 255, CURRENTS, True),),
+    "noname-4ch.eds": (TpdoDefault(1, 0x185, True, 255, CURRENTS),),
     "ambit-f401.eds": (
-        TpdoDefault(1, 0x185, True, 255, ((0x6403, 1, 32), (0x6403, 2, 32)), False),
-        TpdoDefault(2, 0x285, True, 255, ((0x6403, 3, 32), (0x6403, 4, 32)), False),
+        TpdoDefault(1, 0x185, True, 255, ((0x6403, 1, 32), (0x6403, 2, 32))),
+        TpdoDefault(2, 0x285, True, 255, ((0x6403, 3, 32), (0x6403, 4, 32))),
     ),
     "ambit-f404.eds": (
-        TpdoDefault(1, 0x185, True, 255, ((0x6130, 1, 32), (0x6130, 2, 32)), False),
-        TpdoDefault(2, 0x285, True, 255, ((0x6130, 3, 32), (0x6130, 4, 32)), False),
+        TpdoDefault(1, 0x185, True, 255, ((0x6130, 1, 32), (0x6130, 2, 32))),
+        TpdoDefault(2, 0x285, True, 255, ((0x6130, 3, 32), (0x6130, 4, 32))),
     ),
 }
 CHANNELS = {
@@ -327,7 +327,7 @@ def test_cob_ids() -> None:
     assert tpdo("1 ", number=2).cob_id == tpdo("", number=2).cob_id == 0x285  # predefined connection set
     assert tpdo("", number=2).enabled is True
     assert (tpdo("", number=5).cob_id, tpdo("", number=5).enabled) == (0, False)
-    assert tpdo("1 $NODEID+0x6A0", number=512) == TpdoDefault(512, 0x6A5, True, 255, (), False)
+    assert tpdo("1 $NODEID+0x6A0", number=512) == TpdoDefault(512, 0x6A5, True, 255, ())
 
 
 @pytest.mark.parametrize(
@@ -344,13 +344,6 @@ def test_cob_ids() -> None:
 )
 def test_mapping_entries(mapping: str, carried: tuple[tuple[int, int, int], ...]) -> None:
     assert tpdo(mapping=mapping).entries == carried
-
-
-def test_a_mapping_can_be_changed_only_if_count_and_entries_can_be_written() -> None:
-    for count, entry, remappable in (("rw", "rw", True), ("const", "rw", False), ("rw", "ro", False)):
-        subs = f"[1A00sub0]\nAccessType={count}\n[1A00sub1]\nAccessType={entry}\n"
-        assert default_tpdos(read("[1800]\n" + subs))[0].remappable is remappable
-    assert default_tpdos(read("[1800]\n"))[0].remappable is False
 
 
 def test_number_types_are_all_known_and_others_named() -> None:

@@ -280,12 +280,12 @@ def test_a_long_object_comes_in_segments(bench: Any) -> None:
 
 def test_a_failing_object_is_aborted_with_its_code_or_not_answered(bench: Any) -> None:
     node = bench.running()
-    node.fail_sdo[0x1018, 2] = GENERAL
-    node.fail_sdo[0x1801, 2] = None
+    node.sdo.fail[0x1018, 2] = GENERAL
+    node.sdo.fail[0x1801, 2] = None
     assert bench.read(1, 0x1018, 2) == -GENERAL
     assert bench.request(1, b"\x40\x01\x18\x02") == bench.request(1, b"\x2f\x01\x18\x02\x05") == []
     assert bench.read(1, 0x1018, 1) == 0
-    node.fail_sdo.clear()
+    node.sdo.fail.clear()
     assert bench.read(1, 0x1801, 2) == 1
 
 

@@ -114,7 +114,7 @@ def test_switches_may_be_set_while_the_node_is_served(bench: Any) -> None:
                     node.stuck_counts = {n % 4: n}
                     node.wiring = (3, 2, 1, 0)
                     node.stick_channel(n % 4)
-                    node.fail_sdo[n, 0] = None
+                    node.sdo.fail[n, 0] = None
                     node.reboot()
                     node.release_channels()
                     node.wiring = (0, 1, 2, 3)

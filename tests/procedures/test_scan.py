@@ -361,7 +361,7 @@ def test_channels_of_other_vendors_nodes_are_found(
 
 def test_a_refused_identity_is_no_mismatch(wire: VirtualBus) -> None:
     nodes = started(wire, 1)
-    nodes.devices[0x11].fail_sdo[0x1018, 4] = 0x06090011
+    nodes.devices[0x11].sdo.fail[0x1018, 4] = 0x06090011
     expected = deployment(wire, 1)
     reports = scan_buses(expected.buses, QUICK)
     (problem,) = problems(expected, reports).values()

@@ -55,7 +55,6 @@ class TpdoDefault:
     `mapping_entries` : (index, sub-index, bits) in the order of transfer, up to the first that the EDS
     leaves empty;
         indices 1 to 7 are dummy entries, gaps of that length
-    `remappable` : its mapping may be written
     `extended_cob_id` : its 29-bit COB-ID, with bit 29; 0 if it has an 11-bit one
     """
 
@@ -64,7 +63,6 @@ class TpdoDefault:
     enabled: bool
     transmission_type: int
     entries: tuple[tuple[int, int, int], ...]
-    remappable: bool
     extended_cob_id: int = 0
 
 
@@ -121,14 +119,11 @@ def _default_tpdo(dictionary: ObjectDictionary, number: int) -> TpdoDefault:
     if predefined and cob_id & 0x7FF == predefined:  # in some files the firmware adds the node id
         cob_id += node_id
     transmission = raw_value(dictionary, communication, 2)
-    subs = [variable_at(dictionary, mapping, sub) for sub in (0, 1)]
-    writable = [bool(variable.writable) for variable in subs if variable is not None]
     return TpdoDefault(
         number=number,
         cob_id=cob_id & 0x7FF,
         enabled=bool(cob_id & 0x7FF) and not cob_id & (1 << 31 | 1 << 29),
         transmission_type=_EVENT_DRIVEN if transmission is None else transmission,
         entries=tuple(mapping_entries(dictionary, mapping)),
-        remappable=bool(writable) and all(writable),
         extended_cob_id=cob_id & 0x3FFF_FFFF if cob_id & 1 << 29 else 0,
     )

@@ -4,24 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Protocol
 
 from handtouch.canbus import cia301
 from handtouch.device.object_values import ObjectValues
-from handtouch.device.scheduler import ScheduledJob
+from handtouch.device.scheduler import DeviceHost
 
 _GUARD_TIME, _LIFE_TIME_FACTOR = (cia301.GUARD_TIME, 0), (cia301.LIFE_TIME_FACTOR, 0)
 HEARTBEAT_TIME = (cia301.HEARTBEAT_TIME, 0)
 _MS = 1_000_000
-
-
-class JobQueue(Protocol):
-    """Time and jobs of a bus."""
-
-    @property
-    def now_ns(self) -> int: ...
-
-    def schedule(self, due_ns: int, job: ScheduledJob) -> None: ...
 
 
 class ErrorControl:
@@ -33,7 +23,7 @@ class ErrorControl:
 
     def __init__(
         self,
-        bus: JobQueue,
+        bus: DeviceHost,
         objects: ObjectValues,
         send: Callable[[int], None],
         on_life_time_expired: Callable[[], None],

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import random
 import struct
-from contextlib import AbstractContextManager
 from functools import partial
-from typing import Protocol
 
 import can
 from canopen.nmt import COMMAND_TO_STATE, NMT_STATES
@@ -16,9 +14,9 @@ from handtouch.config import eds
 from handtouch.device import inputs
 from handtouch.device.error_control import HEARTBEAT_TIME, ErrorControl
 from handtouch.device.faults import FaultSwitches
-from handtouch.device.object_values import Address, ObjectValues
+from handtouch.device.object_values import ObjectValues
 from handtouch.device.pdo import DeviceTpdo
-from handtouch.device.scheduler import ScheduledJob
+from handtouch.device.scheduler import DeviceHost
 from handtouch.device.sdo import DeviceSdoServer
 from handtouch.device.spec import DeviceSpec
 
@@ -30,27 +28,6 @@ _ERROR_REGISTER, _EMCY_COB_ID = (cia301.ERROR_REGISTER, 0), (cia301.EMCY_COB_ID,
 _LIFE_GUARD_ERROR = 0x8130
 _HISTORY_LENGTH = 8
 _MAX_BACKLOG_NS = 100_000_000  # backlog of a babbling node, after a pause of the program
-
-
-class DeviceHost(Protocol):
-    """Bus of a device: its lock, time, samples and transmission."""
-
-    @property
-    def lock(self) -> AbstractContextManager[bool]: ...
-
-    @property
-    def now_ns(self) -> int: ...
-
-    @property
-    def sample_count(self) -> int: ...
-
-    def schedule(self, due_ns: int, job: ScheduledJob) -> None: ...
-
-    def mark_changed(self) -> None: ...
-
-    def electrode_counts(self, row: int) -> list[int]: ...
-
-    def transmit(self, message: can.Message) -> None: ...
 
 
 class Device(FaultSwitches):
@@ -105,11 +82,6 @@ class Device(FaultSwitches):
     def serial(self) -> int:
         """Serial number, 0x1018 sub 4; 0 without one."""
         return self._objects.get_integer(cia301.IDENTITY, cia301.SERIAL_SUB)
-
-    @property
-    def fail_sdo(self) -> dict[Address, int | None]:
-        """`sdo.fail`: object -> abort code in response to every request for it, None for no response."""
-        return self.sdo.fail
 
     def plug(self) -> None:
         """Power on: boot-up message, defaults, pre-operational; no effect if powered."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import can
 from canopen.sdo import SdoAbortedError
@@ -27,13 +26,8 @@ _RESTRICTED_IDENTIFIERS = (
 _STANDARD_LAYOUT = ((0, 0, 0xFFFF), (1, 16, 0xFFFF), (2, 32, 0xFFFF), (3, 48, 0xFFFF))
 
 
-@dataclass(frozen=True, slots=True)
-class _MappingEntry:
-    """Entry of a PDO mapping."""
-
-    index: int
-    sub: int
-    bits: int
+_Entry = tuple[int, int, int]
+"""Entry of a PDO mapping: index, sub-index, bits."""
 
 
 class DeviceTpdo:
@@ -170,18 +164,18 @@ class DeviceTpdo:
             analogue = index >> 8 == _DELTA >> 8
             self._deltas[channel] = read(_DELTA, sub if analogue else channel + 1)
 
-    def _load_mapping(self, entries: Sequence[_MappingEntry]) -> None:
-        self._length = (sum(entry.bits for entry in entries) + 7) // 8
+    def _load_mapping(self, entries: Sequence[_Entry]) -> None:
+        self._length = (sum(bits for _, _, bits in entries) + 7) // 8
         self._channel_entries: list[tuple[int, int, int]] = []  # channel, first bit, mask
         self._object_entries: list[tuple[Address, int, int]] = []
         first_bit = 0
-        for entry in entries:
-            address, mask = (entry.index, entry.sub), (1 << entry.bits) - 1
+        for index, sub, bits in entries:
+            address, mask = (index, sub), (1 << bits) - 1
             if address in self._channels:
                 self._channel_entries.append((self._channels[address], first_bit, mask))
-            elif entry.index not in cia301.DUMMY_ENTRIES and address in self._objects:
+            elif index not in cia301.DUMMY_ENTRIES and address in self._objects:
                 self._object_entries.append((address, first_bit, mask))
-            first_bit += entry.bits
+            first_bit += bits
         types = [self._objects.integer_type(*address) for address in self._channels]
         self.has_standard_layout = (
             tuple(self._channel_entries) == _STANDARD_LAYOUT
@@ -190,9 +184,9 @@ class DeviceTpdo:
         )
         self.message.dlc = self._length
 
-    def _read_entries(self, count: int) -> list[_MappingEntry]:
+    def _read_entries(self, count: int) -> list[_Entry]:
         raw = [self._objects.get_integer(self._mapping, sub) for sub in range(1, count + 1)]
-        return [_MappingEntry(value >> 16, value >> 8 & 0xFF, value & 0xFF) for value in raw]
+        return [_entry(value) for value in raw]
 
     def _exceeds_delta(self, counts: Sequence[int]) -> bool:
         """Return True if a channel differs from the last value sent by more than its delta."""
@@ -227,8 +221,7 @@ class DeviceTpdo:
         if self._is_valid or (sub and self._objects.get_integer(self._mapping, 0)):
             raise SdoAbortedError(sdo.ABORT_UNSUPPORTED_ACCESS)
         if sub:
-            entry = _MappingEntry(value >> 16, value >> 8 & 0xFF, value & 0xFF)
-            if value and not self._is_mappable(entry):
+            if value and not self._is_mappable(_entry(value)):
                 raise SdoAbortedError(sdo.ABORT_PDO_CANNOT_MAP)
             return
         if any((self._mapping, number) not in self._objects for number in range(1, value + 1)):
@@ -236,11 +229,16 @@ class DeviceTpdo:
         entries = self._read_entries(value)
         if not all(map(self._is_mappable, entries)):
             raise SdoAbortedError(sdo.ABORT_PDO_CANNOT_MAP)
-        if sum(entry.bits for entry in entries) > _PDO_BITS:
+        if sum(bits for _, _, bits in entries) > _PDO_BITS:
             raise SdoAbortedError(sdo.ABORT_PDO_LENGTH_EXCEEDED)
 
-    def _is_mappable(self, entry: _MappingEntry) -> bool:
-        variable = self._objects.find_variable(entry.index, entry.sub)
-        if variable is None or len(variable) != entry.bits:
+    def _is_mappable(self, entry: _Entry) -> bool:
+        index, sub, bits = entry
+        variable = self._objects.find_variable(index, sub)
+        if variable is None or len(variable) != bits:
             return False
-        return entry.index in cia301.DUMMY_ENTRIES or bool(variable.pdo_mappable and variable.readable)
+        return index in cia301.DUMMY_ENTRIES or bool(variable.pdo_mappable and variable.readable)
+
+
+def _entry(value: int) -> _Entry:
+    return value >> 16, value >> 8 & 0xFF, value & 0xFF

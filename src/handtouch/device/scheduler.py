@@ -1,13 +1,38 @@
-"""Jobs in the order of their due times."""
+"""Jobs of a simulated bus in the order of their due times, and the bus as its devices see it."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Protocol
+
+import can
 
 ScheduledJob = Callable[[int, int], int | None]
 """(due time, present time) [ns] -> next due time, None for never."""
+
+
+class DeviceHost(Protocol):
+    """Bus of a device: its lock, time, samples and transmission."""
+
+    @property
+    def lock(self) -> AbstractContextManager[bool]: ...
+
+    @property
+    def now_ns(self) -> int: ...
+
+    @property
+    def sample_count(self) -> int: ...
+
+    def schedule(self, due_ns: int, job: ScheduledJob) -> None: ...
+
+    def mark_changed(self) -> None: ...
+
+    def electrode_counts(self, row: int) -> list[int]: ...
+
+    def transmit(self, message: can.Message) -> None: ...
 
 
 class Scheduler:

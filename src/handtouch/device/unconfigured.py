@@ -10,7 +10,8 @@ from handtouch.canbus import cia301
 from handtouch.canbus.cia305 import LssAddress
 from handtouch.config.eds_file import raw_value
 from handtouch.device.lss import LssSlave, StoreId
-from handtouch.device.node import Device, DeviceHost
+from handtouch.device.node import Device
+from handtouch.device.scheduler import DeviceHost
 from handtouch.device.spec import DeviceSpec
 
 
