@@ -5,8 +5,8 @@ nothing. `object_checks`, `network_checks`, `pdo_checks`, `lss_checks` and `oper
 `catalogue` lists the checks, `required_objects` the objects that a node needs.
 """
 
-from handtouch.procedures.conformance.catalogue import CATALOGUE, Check
-from handtouch.procedures.conformance.line import Line, PortLine
+from handtouch.procedures.conformance.catalogue import CATALOGUE
+from handtouch.procedures.conformance.line import PortLine
 from handtouch.procedures.conformance.procedure import (
     BusInUseError,
     check_bus_is_free,
@@ -16,9 +16,7 @@ from handtouch.procedures.conformance.procedure import (
 )
 from handtouch.procedures.conformance.required_objects import REQUIRED_OBJECTS
 from handtouch.procedures.conformance.results import (
-    CheckResult,
     NodeReport,
-    RateMeasurement,
     Verdict,
     count_verdicts,
 )
@@ -29,14 +27,10 @@ __all__ = [
     "CATALOGUE",
     "REQUIRED_OBJECTS",
     "BusInUseError",
-    "Check",
-    "CheckResult",
     "ConformanceOptions",
-    "Line",
     "NodeReport",
     "NodeUnderTest",
     "PortLine",
-    "RateMeasurement",
     "Targets",
     "Verdict",
     "check_bus_is_free",

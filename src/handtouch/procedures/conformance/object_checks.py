@@ -123,7 +123,8 @@ def check_writing(session: NodeSession) -> None:
             report.passed("excitation.switch")
         except BootStepError as error:
             report.failed("excitation.switch", str(error))
-    problems, tested = [], 0
+    problems: list[str] = []
+    tested = 0
     absent = [(index, 0, _NO_OBJECT) for index in _ABSENT_INDICES]
     for index, sub, code in (*absent, (cia301.IDENTITY, 5, _NO_SUB)):
         try:
