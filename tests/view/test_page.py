@@ -138,6 +138,16 @@ def test_an_l_shaped_pad_is_drawn_with_its_re_entrant_corner() -> None:
     assert np.hypot(x - middle[0], y - middle[1]).min() < 1.0
 
 
+def test_pads_of_several_hands_carry_the_hand_s_name() -> None:
+    (hand,) = DEPLOYMENT.hands
+    left = hand.model_copy(update={"name": "left"})
+    both = scene_of(DEPLOYMENT.model_copy(update={"hands": (hand, left)}), {})
+    assert {pad["name"] for pad in both["pads"]} == {
+        f"{name}/{link}" for name in ("right", "left") for link in LINKS
+    }
+    assert {pad["name"] for pad in scene_of(DEPLOYMENT, {})["pads"]} == set(LINKS)
+
+
 def test_link_poses_agree_with_the_kinematics() -> None:
     scene = scene_of(DEPLOYMENT, FILES)
     robot = read_urdf(shipped.path("utah_mit.urdf"))

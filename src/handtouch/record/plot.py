@@ -27,6 +27,7 @@ _LINE_COLOR, _GRID_COLOR = "#222222", "#d9d9d9"
 _BLUE, _RED = "#0072b2", "#d55e00"
 _COLOR_OF_STATE = {
     "clear": "#e3efe3",
+    "touched": "#56b4e9",
     "stale": "#f0e442",
     "lost": "#d55e00",
     "faulted": "#cc79a7",
@@ -35,6 +36,7 @@ _COLOR_OF_STATE = {
 }
 _END_MARKERS = "x+*1^"
 _COLOR_MAP = "viridis"
+_EDGE_CELLS = 40
 _DPI = 200
 _WIDTH_IN = 7.2
 _STYLE = {
@@ -88,8 +90,9 @@ class ContactHistory:
 class PlotData:
     """Data of a recording's figures; pads by "hand/link"."""
 
-    pads: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """length and width [mm], of the deployment's pads in its order"""
+    pads: dict[str, NDArray[Any] | None] = field(default_factory=dict)
+    """edge of the unrolled pad [mm], (k, 2) as `Surface.edge_m`, of the deployment's pads in its order; None
+    where the recording doesn't describe the pad"""
     contacts: dict[str, dict[tuple[int, int], ContactHistory]] = field(
         default_factory=lambda: defaultdict(dict)
     )
@@ -113,7 +116,7 @@ def read_plot_data(recording: Recording, from_s: float = 0.0, to_s: float | None
         t_s = (t_ns - first_ns) * 1e-9
         prefix, _, pad = topic.partition("/")
         if prefix == "config":
-            data.pads |= _pad_sizes(Deployment.model_validate_json(payload["deployment"]))
+            data.pads |= _pad_edges(Deployment.model_validate_json(payload["deployment"]))
         if not from_s <= t_s <= (float("inf") if to_s is None else to_s):
             continue
         data.end_s = max(data.end_s, t_s)
@@ -121,13 +124,13 @@ def read_plot_data(recording: Recording, from_s: float = 0.0, to_s: float | None
             key = payload["session"], payload["id"]
             data.contacts[pad].setdefault(key, ContactHistory()).add_message(t_s, payload)
         elif prefix == "health":
-            state = payload["state"].replace("touched", "clear")  # one sample a second doesn't show contacts
+            state = payload["state"].replace("touched", "clear")  # contacts say when, to the sample
             data.health[pad].append((t_s, state))
         elif prefix == "service":
             episodes = sum(payload["congestion_episodes"].values())
             data.service.append((t_s, payload["rate_hz"], payload["overruns"], episodes))
     for pad in [*data.contacts, *data.health]:
-        data.pads.setdefault(pad, (float("nan"), float("nan")))
+        data.pads.setdefault(pad, None)
     if not data.service and not data.contacts:
         raise ValueError(f"{recording.path}: holds no message of a daemon in that time")
     return data
@@ -152,13 +155,12 @@ def draw(data: PlotData, folder: Path, on_progress: Callable[[str], None] = lamb
     return made
 
 
-def _pad_sizes(deployment: Deployment) -> dict[str, tuple[float, float]]:
-    made = {}
-    for hand in deployment.hands:
-        for pad in hand.pads:
-            length_m, width_m = pad_surface(pad).extent_m
-            made[f"{hand.name}/{pad.link}"] = length_m * 1e3, width_m * 1e3
-    return made
+def _pad_edges(deployment: Deployment) -> dict[str, NDArray[Any] | None]:
+    return {
+        f"{hand.name}/{pad.link}": 1e3 * pad_surface(pad).edge_m(_EDGE_CELLS)
+        for hand in deployment.hands
+        for pad in hand.pads
+    }
 
 
 def _figure(rows: int, columns: int, height_in: float, **shared: Any) -> tuple[Figure, list[Axes]]:
@@ -270,24 +272,33 @@ def _force_legend() -> list[Any]:
 
 
 def _draw_pads(data: PlotData) -> Figure:
-    """Draw each touched pad unrolled, with the paths of its contacts coloured by force."""
-    from matplotlib.colors import Normalize
+    """Draw each touched pad unrolled, with the paths of its contacts coloured by force.
+
+    The colours are of the root of the force, so that light contacts differ beside firm ones.
+    """
+    from matplotlib.colors import PowerNorm
     from matplotlib.lines import Line2D
-    from matplotlib.patches import Rectangle
+    from matplotlib.patches import Polygon
 
     pads = data.touched_pads
     columns = min(len(pads), 4)
     rows = -(-len(pads) // columns)
     figure, grid = _figure(rows, columns, 0.5 + _WIDTH_IN / max(columns, 2) * rows)
-    scale = Normalize(0, _max_force_n(data))
+    scale = PowerNorm(0.5, 0, _max_force_n(data))
     dots = None
     for axes, pad in zip(grid, pads, strict=False):
-        length, width = data.pads[pad]
-        if np.isfinite(length):
-            axes.add_patch(Rectangle((0, 0), length, width, fill=False, edgecolor=_LINE_COLOR, linewidth=0.8))
-            axes.set(xlim=(-0.04 * length, 1.04 * length), ylim=(-0.04 * width, 1.04 * width))
+        edge = data.pads[pad]
+        if edge is not None:
+            axes.add_patch(Polygon(edge, fill=False, edgecolor=_LINE_COLOR, linewidth=0.8))
+            low, high = edge.min(axis=0), edge.max(axis=0)
+            margin = 0.04 * (high - low)
+            (left, bottom), (right, top) = low - margin, high + margin
+            axes.set(xlim=(left, right), ylim=(bottom, top))
         for contact in data.contacts[pad].values():
             x, y = np.array(contact.pad_mm).T
+            if edge is not None:  # from y0 to the centre line
+                upper = edge[: len(edge) // 2]
+                y = y - np.interp(x, *upper.T)
             axes.plot(x, y, color=_GRID_COLOR, linewidth=0.6, zorder=1)
             dots = axes.scatter(
                 x,
@@ -304,7 +315,7 @@ def _draw_pads(data: PlotData) -> Figure:
         axes.set_aspect("equal")
         axes.set_title(_pad_label(pad, data), loc="left", fontsize=8)
         axes.set_xlabel("from x0 [mm]")
-        axes.set_ylabel("from y0 [mm]")
+        axes.set_ylabel("from the centre line [mm]" if edge is not None else "from y0 [mm]")
     for axes in grid[len(pads) :]:
         axes.set_visible(False)
     if dots is not None:
@@ -333,6 +344,11 @@ def _draw_health(data: PlotData) -> Figure:
         for (from_s, state), (to_s, _) in zip(states, [*states[1:], (data.end_s, "")], strict=True):
             color = seen[state] = _COLOR_OF_STATE.get(state, _LINE_COLOR)
             strip.broken_barh([(from_s, to_s - from_s)], (row - 0.4, 0.8), facecolors=color, linewidth=0)
+    for row, pad in enumerate(pads):
+        spans = [(c.times_s[0], c.times_s[-1] - c.times_s[0]) for c in data.contacts.get(pad, {}).values()]
+        if spans:
+            seen["touched"] = _COLOR_OF_STATE["touched"]
+            strip.broken_barh(spans, (row - 0.4, 0.8), facecolors=seen["touched"], linewidth=0)
     strip.set_yticks(range(len(pads)), [_pad_label(pad, data) for pad in pads])
     strip.set(ylim=(len(pads) - 0.5, -0.5), xlim=(_begin_s(data), max(data.end_s, 1e-3)))
     strip.tick_params(axis="both", length=0)

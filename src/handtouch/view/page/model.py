@@ -104,6 +104,7 @@ class PageModel:
         self.values.set_value("percepts_enabled", percepts)
         self._session: int | None = None
         self._deployment = ""
+        self._has_hands = False
         self._frames: dict[str, wire.HandFrame] = {}
         self._short_contacts: dict[str, tuple[wire.HandFrame, int]] = {}
         self._health: dict[str, wire.Health] = {}
@@ -180,6 +181,7 @@ class PageModel:
         except ValidationError as error:
             self._append_message(message.t_ns, f"can't read the daemon's deployment: {error}", "lost")
             return
+        self._has_hands = len(deployment.hands) > 1
         scene = scene_of(deployment, message.files)
         self.values.set_value("scene", scene)
         for problem in scene["problems"]:
@@ -187,25 +189,26 @@ class PageModel:
 
     def _add_health(self, health: wire.Health) -> None:
         key = f"{health.hand}/{health.link}"
+        name = key if self._has_hands else health.link
         before, self._health[key] = self._health.get(key), health
         if health.state in _FAULT_STATES and self._faults.get(key) != (health.state, health.reason):
             self._faults[key] = health.state, health.reason
             reason = health.reason.removeprefix(f"{health.state}: ")
             why = f": {reason}" if reason else f", node {health.node_state}"
-            self._append_message(health.t_ns, f"{health.state}{why}", health.state, health.link)
+            self._append_message(health.t_ns, f"{health.state}{why}", health.state, name)
         elif health.state in _OK_STATES and key in self._faults:
             del self._faults[key]
-            self._append_message(health.t_ns, "recovered", "clear", health.link)
+            self._append_message(health.t_ns, "recovered", "clear", name)
         known = {diagnosis.get("kind") for diagnosis in before.diagnoses} if before else set()
         for diagnosis in health.diagnoses:
             if diagnosis.get("kind") not in known:
-                self._append_message(health.t_ns, diagnosis_text(diagnosis), "unreliable", health.link)
+                self._append_message(health.t_ns, diagnosis_text(diagnosis), "unreliable", name)
         if (
             before
             and before.calibration_state in UNCALIBRATED_STATES
             and health.calibration_state not in UNCALIBRATED_STATES
         ):
-            self._append_message(health.t_ns, f"{health.calibration_state} again", "clear", health.link)
+            self._append_message(health.t_ns, f"{health.calibration_state} again", "clear", name)
         self._set_pad(key, health.state)
 
     def _set_pad(self, key: str, state: str) -> None:

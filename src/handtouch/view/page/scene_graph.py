@@ -78,6 +78,8 @@ class _SceneGraph:
             {
                 "key": f"{hand.name}/{pad.link}",
                 "link": pad.link,
+                "hand": hand.name,
+                "name": pad.link,
                 "node": node,
                 "centre": at.tolist(),
                 "outline": outline_m(surface).round(6).tolist(),
@@ -99,6 +101,9 @@ def scene_of(deployment: Deployment, files: dict[str, bytes]) -> dict[str, Any]:
         across = np.concatenate(scene.points[first:])[:, 1]
         offset = float(across.max()) + _HAND_SPACING_M
         scene.columns.extend(numbers)
+    if len(deployment.hands) > 1:
+        for shown in scene.pads:
+            shown["name"] = shown["key"]
     camera, right = _camera(scene)
     middle = [np.mean([scene.faces[pad][0] @ right for pad in column]) for column in scene.columns]
     return {

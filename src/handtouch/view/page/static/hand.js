@@ -151,6 +151,14 @@ export class HandView {
     return distance < 28 ? pad : null;
   }
 
+  // Returns the middle of each hand's pads, where there are several hands.
+  handNames() {
+    const points = Map.groupBy ? Map.groupBy(this.pads, (pad) => pad.hand) : new Map();
+    if (points.size < 2) return [];
+    const middle = (all) => m.scale(all.reduce(m.add), 1 / all.length);
+    return [...points].map(([hand, pads]) => [middle(pads.map((pad) => m.point(this.poses[pad.node], pad.centre))), "hand-name", hand]);
+  }
+
   label(state, touched) {
     const labels = [], few = touched.length <= MAX_FULL_LABELS;
     for (const [pad, contact] of touched) {
@@ -162,8 +170,9 @@ export class HandView {
     }
     for (const pad of this.pads) {
       const health = state.pads[pad.key];
-      if (FAULTS.includes(health?.status) && this.countFaults(state) <= 4) labels.push([m.point(this.poses[pad.node], pad.centre), health.status, `${STATUS_SIGNS[health.status]} ${pad.link}: ${statusText(health)}`]);
+      if (FAULTS.includes(health?.status) && this.countFaults(state) <= 4) labels.push([m.point(this.poses[pad.node], pad.centre), health.status, `${STATUS_SIGNS[health.status]} ${pad.name}: ${statusText(health)}`]);
     }
+    labels.push(...this.handNames());
     while (this.labels.children.length < labels.length) this.labels.append(document.createElement("span"));
     const corner = this.canvas.getBoundingClientRect();
     const taken = [...this.canvas.parentElement.querySelectorAll("header, footer")].map((part) => boxOf(part.getBoundingClientRect()));

@@ -40,7 +40,8 @@ export class PadsView {
       const middle = x + (widths[number] * k) / 2;
       const used = tall[number] * k + column.length * (LABEL + GAP) - GAP;
       let y = high - used - GAP;
-      if (column.length > 1) this.write(context, digitOf(this.scene.pads[column[0]].link), middle, 11, "#d5dce4", 600);
+      const first = this.scene.pads[column[0]], hand = first.name === first.link ? "" : `${first.hand} `;
+      if (column.length > 1 || hand) this.write(context, hand + (column.length > 1 ? digitOf(first.link) : ""), middle, 11, "#d5dce4", 600);
       for (const pad of [...column].reverse()) { // the fingertip on top
         const size = this.sizes[pad][0] * k;
         this.drawPad(context, state, pad, middle, y + LABEL + size / 2, k);

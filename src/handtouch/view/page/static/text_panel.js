@@ -75,7 +75,7 @@ export function drawNodes({ connected, alive, scene, pads }) {
     sign.textContent = STATUS_SIGNS[statusOf(health)];
     sign.style.color = colourOfStatus(health);
     note.textContent = words === "ok" ? "" : words.split(",")[0];
-    chip.setAttribute("aria-label", `${scene.pads[number].link}: ${words}`);
+    chip.setAttribute("aria-label", `${scene.pads[number].name}: ${words}`);
   });
 }
 
@@ -84,7 +84,7 @@ function newChip(pad) {
   const chip = element("button", "", "");
   chip.type = "button";
   chip.dataset.key = pad.key;
-  chip.append(signOf("starting"), element("span", "", pad.link.replaceAll("_", " ")), element("em", "", ""));
+  chip.append(signOf("starting"), element("span", "", pad.name.replaceAll("_", " ")), element("em", "", ""));
   return chip;
 }
 

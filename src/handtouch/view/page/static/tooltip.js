@@ -27,7 +27,7 @@ export class Tooltip {
     if (!this.pad) return;
     const { pad } = this, health = state.pads[pad.key], contact = state.contacts[pad.key];
     const known = state.connected && state.alive ? "" : "last known: ";
-    const lines = [`${pad.link}: ${known}${statusText(health)}`, pad.node_text];
+    const lines = [`${pad.name}: ${known}${statusText(health)}`, pad.node_text];
     if (health?.rate_hz !== undefined) lines[1] += `, ${health.rate_hz} samples/s`;
     if (contact) lines.push(`contact ${contact.id}, ${forceText(contact)}`);
     if (health && problemOf(health)) lines.push(problemOf(health));
