@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -233,7 +234,6 @@ def test_values_that_are_no_integers_are_read_in_their_type() -> None:
         ("[1000]\nObjectType=zz\n", 2, 'ObjectType "zz"'),
         ("[1000]\nObjectType=0x77\n", 2, "ObjectType 119"),
         ("[1000]\nDataType=0x999\n", 2, "unknown DataType 0x0999"),
-        ("[1000]\nAccessType=maybe\n", 2, "AccessType maybe"),
         ("[1000]\n[1000sub100]\n", 2, "sub-index above"),
         ("[1000]\n[1018sub\n", 2, "no closing bracket"),
         ("[1000]\n1018sub0]\n", 2, "no opening bracket"),
@@ -263,6 +263,13 @@ def test_mistakes_elsewhere_cost_only_the_value() -> None:
     assert (found[0x2005, 0].min, found[0x2005, 0].max) == (None, -32768)
     assert 0x2008 not in dictionary
     assert serve_all(dictionary) == 2  # strings go out as ASCII
+
+
+def test_how_objects_may_be_accessed_is_asked_of_the_node_not_of_the_file() -> None:
+    text = Path(shipped.path("handtouch-node.eds")).read_text()
+    odd = read(re.sub("AccessType=.*", "AccessType=UNKNOWN", text))
+    assert [t.entries for t in default_tpdos(odd)] == [t.entries for t in default_tpdos(read(text))]
+    assert {variable.access_type for variable in variables(odd).values()} == {"rw"}
 
 
 def test_defaults_of_channels_need_not_fit_their_type() -> None:

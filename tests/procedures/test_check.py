@@ -96,6 +96,18 @@ def test_unreachable_full_scale_is_a_warning() -> None:
     assert "full_scale_counts = 40000: its channels reach at most 32767" in warning
 
 
+@pytest.mark.parametrize(("allowed", "then"), [("true", "has them mapped over SDO"), ("false", "is faulted")])
+def test_an_eds_that_maps_other_objects_is_a_warning_with_what_it_maps(allowed: str, then: str) -> None:
+    eds = f'eds = "{shipped.path("handtouch-node.eds")}"\nallow_pdo_remapping = {allowed}\n'
+    other = 'channels = ["0x1018:1", "0x1018:2", "0x1018:3", "0x1018:4"]\n'
+    channels = "drive_v = 5.0"
+    assert not warnings_of((channels, eds + channels))
+    (warning,) = warnings_of((channels, eds + other + channels))
+    assert "no TPDO carries 0x1018:01 (unsigned 32 bit)" in warning
+    assert "TPDO2 has 0x6401:01 (16 bit)" in warning
+    assert then in warning
+
+
 def test_warnings_exit_with_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("serial = 1001\n", ""))

@@ -248,7 +248,7 @@ class _EdsReader:
         values_matter = strict and index not in self._mapped
         result = EdsVariable(name, index, sub, f"{self._path}:{section.get('DataType')[0]}")
         result.data_type = self._parse_type(index, sub, section, grouped=grouped)
-        result.access_type = self._parse_access(section, strict)
+        result.access_type = self._parse_access(section)
         result.pdo_mappable = bool(self._parse_number(section, "PDOMapping", strict=False))
         result.default = self._parse_value(section, "DefaultValue", result.data_type, values_matter)
         result.value = self._parse_value(section, "ParameterValue", result.data_type, values_matter)
@@ -279,12 +279,13 @@ class _EdsReader:
         self._report_problem(line, f"object 0x{index:04X} sub {sub} has {what}; correct it", strict)
         return int(datatypes.DOMAIN)  # its data are bytes
 
-    def _parse_access(self, section: _EdsSection, strict: bool) -> str:
-        text = re.sub("[^a-z]", "", _strip_comment(self._get_text(section, "AccessType", strict)).lower())
+    def _parse_access(self, section: _EdsSection) -> str:
+        """Return how an object may be accessed; "rw" if that isn't understood: the node decides."""
+        text = re.sub("[^a-z]", "", _strip_comment(self._get_text(section, "AccessType", False)).lower())
         if text and text not in _ACCESS_TYPES:
             line = section.get("AccessType")[0]
             self._report_problem(
-                line, f"AccessType {text} is none of {', '.join(_ACCESS_TYPES)}; correct it", strict
+                line, f"AccessType {text} is none of {', '.join(_ACCESS_TYPES)}", strict=False
             )
         return text if text in _ACCESS_TYPES else "rw"
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from handtouch import config
 from handtouch.canbus.bus.load import burst_s, bus_load
-from handtouch.canbus.nodes.spec import check_nodes
-from handtouch.config.channels import full_scale_counts, max_count
+from handtouch.canbus.nodes.spec import check_mapping, check_nodes
+from handtouch.config.channels import channel_states, full_scale_counts, max_count
+from handtouch.config.eds import EdsError
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.pad_model import contact_law, law_of
 from handtouch.hand import pad_network, pad_surface
@@ -90,6 +91,7 @@ def find_warnings(deployment: config.Deployment) -> Iterator[str]:
                 f"[node.{name}]: full_scale_counts = {node.full_scale_counts}: its channels reach at most "
                 f"{limit}, so full_scale_ma is never reached; check the type of the channels"
             )
+    yield from _mapping_warnings(deployment)
     yield from unchecked_items(deployment)
     for hand in deployment.hands:
         yield from _serial_warnings(hand)
@@ -118,6 +120,19 @@ def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[st
             f"waits {window_ms:.2f} ms (sample_window_fraction = "
             f"{deployment.daemon.sample_window_fraction}): the last ones are used one period late"
         )
+
+
+def _mapping_warnings(deployment: config.Deployment) -> Iterator[str]:
+    """Yield what EDS files have instead of the channels; of a listener that is an error of the file."""
+    asked = {bus.name for bus in deployment.buses if bus.role != "listener"}
+    pads = (pad for _, pad in deployment.pads if pad.bus in asked and deployment.nodes[pad.node].eds)
+    for pad in {(pad.node, channel_states(pad)): pad for pad in pads}.values():
+        node = deployment.nodes[pad.node]
+        try:
+            check_mapping(node, pad)
+        except EdsError as error:
+            remapped = "has them mapped over SDO when it boots" if node.allow_pdo_remapping else "is faulted"
+            yield f"[node.{pad.node}]: {error}; a node with this mapping {remapped}"
 
 
 def _serial_warnings(hand: config.HandTable) -> Iterator[str]:

@@ -1,7 +1,7 @@
 """Nodes of a deployment as the master gets them, and their status and events as it reports them.
 
 Public names: `Identity`, `IdleSettings`, `NodeSpec`, `node_specs`, `sync_overflows`, `check_nodes`,
-`NodeStatus`; `MasterEvent`, a union of `NodeEvent`, `ErrorChanged` and `SerialChanged`.
+`check_mapping`, `NodeStatus`; `MasterEvent`, a union of `NodeEvent`, `ErrorChanged` and `SerialChanged`.
 """
 
 from __future__ import annotations
@@ -156,9 +156,7 @@ def _find_problems(deployment: Deployment) -> Iterator[Problem]:
                     if pad.node == name and pad.switch_states:
                         yield from _find_wide_states(f"{hand.name}/{pad.link}", pad, channels)
                     if pad.node == name and pad.bus in listener_buses:
-                        states = channel_states(pad)
-                        ordered = order_by_electrode(channels, pad) if states else channels
-                        mapping_from_eds(kind.eds, pad.node_id, ordered, states)
+                        check_mapping(kind, pad)
         except EdsError as error:
             yield Problem(f"{prefix}channels", "", str(error))
         else:
@@ -177,6 +175,13 @@ def _find_problems(deployment: Deployment) -> Iterator[Problem]:
                 yield from _find_unwritable(f"{prefix}delta_objects", text, kind.idle.delta_counts)
             if kind.idle.enable_object:
                 yield from _find_unwritable(f"{prefix}enable_object", kind.idle.enable_object)
+
+
+def check_mapping(kind: Node, pad: Pad) -> None:
+    """Check that TPDOs carry a pad's channels by its node's EDS, or without one. Raises EdsError."""
+    channels, states = node_channels(kind), channel_states(pad)
+    ordered = order_by_electrode(channels, pad) if states else channels
+    mapping_from_eds(kind.eds, pad.node_id, ordered, states)
 
 
 def _find_wide_states(name: str, pad: Pad, channels: Channels) -> Iterator[Problem]:

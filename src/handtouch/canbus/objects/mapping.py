@@ -18,12 +18,12 @@ from handtouch.config.channels import Channel, Channels
 from handtouch.core.slab import PDO_BYTES, ChannelField, ChannelLayout
 
 DEFAULT_TPDO_NUMBERS = (2, 1, 3, 4)
+"""Without an EDS: those of the predefined connection set, that of CiA 401's analogue inputs first."""
 _FURTHER_TPDOS = 12
 """TPDOs 5 to 16 are searched, too, in nodes without an EDS, until one is missing."""
 _MULTIPLEXED = (254, 255)
 LENGTH_BIT_7 = 0x80
 """A length is 64 bits at most; some nodes set this bit, which means nothing."""
-"""Without an EDS: those of the predefined connection set, that of CiA 401's analogue inputs first."""
 _PDO_IDENTIFIERS = frozenset({*range(0x181, 0x581), 0x600, *range(0x680, 0x6E0)})
 """Identifiers that CANopen doesn't reserve for other services."""
 _PDO_BITS = 8 * PDO_BYTES
@@ -268,8 +268,9 @@ def _remap(
     ]
     if len(free) < len(groups):
         raise BootStepError(
-            f"no TPDO carries {_channel_names(channels)}, and {len(groups)} that carry nothing else are "
-            f"needed to map them; {_describe_tpdos(candidates)}; map them in the node and store the mapping"
+            f"no TPDO carries {_channel_names(channels)}; TPDOs without other objects: {len(free)}, needed "
+            f"to map them: {len(groups)}; {_describe_tpdos(candidates)}; map them in the node and store the "
+            "mapping"
         )
     enter_preoperational()
     mapped = [
