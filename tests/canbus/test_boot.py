@@ -347,6 +347,38 @@ def test_late_responses_to_earlier_requests_are_reported_as_late() -> None:
     assert e.value.timed_out
 
 
+def test_answers_of_a_server_one_request_behind_are_taken_for_the_requests_they_answer() -> None:
+    """Each request is repeated before its answer comes, so each is answered twice, in their order."""
+    node = Node({(0x1017, 0): (0, 2)})
+    plain, waiting = node.answer, list[bytes]()
+
+    def behind(can_id: int, data: bytes) -> bool:
+        if data[0] != 0x80:
+            waiting.append(data)
+        return len(waiting) < 2 or data[0] == 0x80 or plain(can_id, waiting.pop(0))
+
+    node.intercept(behind)
+    node.sdo.write_if_different(0x1017, 0, 100, 2, "heartbeat time")
+    assert node.objects[0x1017, 0] == (100, 2)
+    assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
+
+
+def test_a_late_answer_to_an_earlier_request_starts_the_timeout_again() -> None:
+    requests: list[bytes] = []
+    answers = [bytes.fromhex("4318100107000000"), bytes.fromhex("4b17100064000000")]
+
+    def at_timeout() -> int:
+        transport.deliver_response(answers.pop(0))
+        return 1 << 62
+
+    transport = SdoTransport(5, lambda _, data: not requests.append(data), 0.005, at_timeout)
+    sdo = NodeSdoClient(transport)
+    answers.insert(0, answers[0])
+    assert sdo.read(0x1018, 1, "vendor id") == 7
+    assert sdo.read(0x1017, 0, "heartbeat time") == 100
+    assert [data[1:4].hex() for data in requests] == ["181001", "171000"]
+
+
 def test_garbled_response_is_an_error_not_a_value() -> None:
     node = Node({})
 

@@ -235,7 +235,7 @@ class Master:
         return events
 
     def stop(self, now_ns: int) -> None:
-        """Send NMT stop to each configured node and wait for the workers to end (up to 0.2 s)."""
+        """Make each configured node pre-operational and wait for the workers to end (up to 0.2 s)."""
         for node in self._nodes:
             self._advance(node, StopRequested(), now_ns)
         if self._workers is not None:

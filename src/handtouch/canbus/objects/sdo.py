@@ -30,7 +30,12 @@ _TPDO_PARAMETERS = {
     5: "event timer",
     cia301.SYNC_START_SUB: "SYNC start value",
 }
-_COMMANDS_WITH_OBJECT = (0x40, 0x60, 0x80)  # responses with index and sub-index: upload, download, abort
+_MAX_LATE_RESPONSES = 4
+_COMMAND_MASK, _ABORT = 0xE0, 0x80
+_UPLOAD, _DOWNLOAD = 0x40, 0x60
+_COMMANDS_WITH_OBJECT = (_UPLOAD, _DOWNLOAD, _ABORT)  # responses with index and sub-index
+_INITIATE_RESPONSES = {0x40: _UPLOAD, 0x20: _DOWNLOAD}
+"""By the command of the request; that of a segment has none of them."""
 _NO_OBJECT_ABORT_CODES = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})
 
 
@@ -65,21 +70,42 @@ class ObjectTransport(Protocol):
 
 
 class _SdoNetwork:
-    """The part of a canopen network that its SDO client uses."""
+    """The part of a canopen network that its SDO client uses; `command` is that of the latest request."""
 
     def __init__(self, send: Callable[[int, bytes], bool]) -> None:
         self._send = send
+        self.command = 0
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
+        self.command = data[0] & _COMMAND_MASK
         self._send(can_id, bytes(data))
 
 
 class _SdoClient(SdoClient):  # type: ignore[misc]  # canopen has no types
-    """canopen's client, whose timeout expires only once the frames that arrived before it have been read."""
+    """canopen's client, whose timeout expires only once the frames that arrived before it have been read.
+
+    `responded`: to a request of this attempt. `late_responses`: to earlier requests, so far; a node that
+    sends one is about to respond, and the timeout starts again.
+    """
 
     received_until_ns: Callable[[], int] | None = None
+    responded = False
+    late_responses = 0
 
     def read_response(self) -> bytes:
+        most = self.late_responses + _MAX_LATE_RESPONSES
+        while True:
+            late_before = self.late_responses
+            try:
+                response = self._read_received()
+            except SdoCommunicationError:
+                if self.late_responses == late_before or self.late_responses > most:
+                    raise
+            else:
+                self.responded = True
+                return response
+
+    def _read_received(self) -> bytes:
         deadline_ns = time.monotonic_ns() + round(self.RESPONSE_TIMEOUT * 1e9)
         try:
             return bytes(super().read_response())
@@ -118,10 +144,9 @@ class SdoTransport:
             cia301.SDO_REQUEST + node_id, cia301.SDO_RESPONSE + node_id, ObjectDictionary()
         )
         self._client.received_until_ns = received_until_ns
-        self._client.network = _SdoNetwork(send)
+        self._client.network = self._network = _SdoNetwork(send)
         self._client.RESPONSE_TIMEOUT = self._timeout_s = SDO_TIMEOUT_S if timeout_s is None else timeout_s
         self.awaiting_response = False
-        self._responded = False
         self.responses = 0
         """responses received so far, invalid ones included"""
         self._dropped: bytes | None = None
@@ -131,18 +156,26 @@ class SdoTransport:
     def deliver_response(self, data: bytes) -> None:
         """Pass on a response, from the receiving thread, while `awaiting_response`.
 
-        A response for another object is dropped: it is late, or answers a probe or another master; so is one
-        of another length than 8 bytes. The reason of a timeout has the latest one dropped.
+        A response for another object, or to an upload after a download, is dropped: it is late, or answers a
+        probe or another master; so is one of another length than 8 bytes. The reason of a timeout has the
+        latest one dropped.
         """
         self.responses += 1
-        is_invalid = len(data) != cia301.SDO_BYTES
-        if is_invalid or (
-            data[0] & 0xE0 in _COMMANDS_WITH_OBJECT and data[1:4] not in (self._object, bytes(3))
-        ):
-            self._dropped = data
+        if len(data) == cia301.SDO_BYTES and not self._is_of_another_request(data):
+            self._client.on_response(0, data, 0.0)
             return
-        self._responded = True
-        self._client.on_response(0, data, 0.0)
+        self._client.late_responses += self._is_late(data)
+        self._dropped = data
+
+    def _is_of_another_request(self, data: bytes) -> bool:
+        command = data[0] & _COMMAND_MASK
+        if command in _COMMANDS_WITH_OBJECT and data[1:4] not in (self._object, bytes(3)):
+            return True
+        expected = _INITIATE_RESPONSES.get(self._network.command)
+        return command in (_UPLOAD, _DOWNLOAD) and command != expected
+
+    def _is_late(self, data: bytes) -> bool:
+        return len(data) == cia301.SDO_BYTES and data[1:4] in self._requested
 
     def transfer(
         self,
@@ -163,14 +196,14 @@ class SdoTransport:
         for _ in range(MAX_SDO_ATTEMPTS):
             if is_cancelled():
                 raise BootStepCancelled
-            self._responded = False
+            self._client.responded = False
             self.awaiting_response = True
             try:
                 return run(self._client)
             except SdoAbortedError as error:
                 raise BootStepError(f"{description}: refused by the node ({error})") from error
             except SdoCommunicationError as error:
-                if self._responded:
+                if self._client.responded:
                     silent = isinstance(error.__context__, queue.Empty)
                     cause = (
                         f"no answer within {self._timeout_s * 1e3:.0f} ms after the first segments"
@@ -190,7 +223,7 @@ class SdoTransport:
         dropped = self._dropped
         if dropped is None:
             return f"no answer {limit}; is its SDO server running, the bus overloaded?"
-        if len(dropped) == cia301.SDO_BYTES and dropped[1:4] in self._requested:
+        if self._is_late(dropped) and dropped[1:4] != self._object:
             index, sub = int.from_bytes(dropped[1:3], "little"), dropped[3]
             return (
                 f"no answer {limit}, but a late one to an earlier request, 0x{index:04X}:{sub:02X}; "
