@@ -64,7 +64,7 @@ class Slab:
 
     `arrival_ns` (size,) int64 arrival of its last PDO on the host's monotonic clock, 0 before the first;
     `fresh` (size,) uint8, 1 if it arrived since `begin_cycle`; `repeat_counts` (size,) int64, samples that
-    replaced a fresh one.
+    replaced a fresh one; `contrary_counts` (size,) int64, cycles that ended with PDOs of two contents.
     """
 
     def __init__(self, size: int, channels: int = 4, columns: Sequence[Sequence[int]] | None = None) -> None:
@@ -72,6 +72,7 @@ class Slab:
         self._columns = columns or [range(channels)] * size
         self.arrival_ns: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.repeat_counts: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
+        self.contrary_counts: NDArray[np.int64] = np.zeros(size, dtype=np.int64)
         self.fresh_count = 0
         self._bytes = bytearray(size * _SAMPLE_BYTES)
         self._words: NDArray[np.int64] = np.frombuffer(self._bytes, dtype="<i8")
@@ -80,6 +81,7 @@ class Slab:
         self._fresh = bytearray(size)
         self.fresh: NDArray[np.uint8] = np.frombuffer(self._fresh, dtype=np.uint8)
         self._single = bytearray(size)  # 1 where a sample is one PDO
+        self._contrary = bytearray(size)  # 1 where PDOs of two contents arrived in this cycle
         self._partial_samples: dict[
             int, _PartialSample | _ScheduledSample
         ] = {}  # unfinished samples of pads with several PDOs
@@ -93,8 +95,10 @@ class Slab:
             self._words.data,
             self._arrival_ns,
             self._repeat_counts,
+            self.contrary_counts.data,
             memoryview(self._fresh),
             memoryview(self._single),
+            memoryview(self._contrary),
             *(view_memory(a) for a in (self._counts, self._fields, self._low_limits, self._high_limits)),
         )
         """the same memory as the stages take it"""
@@ -138,12 +142,18 @@ class Slab:
         several PDOs is dropped if the previous SYNC brought fewer than all: the missing ones may arrive now.
         """
         if self._single[slot]:
-            start = slot * _SAMPLE_BYTES
-            self._bytes[start : start + PDO_BYTES] = data.ljust(PDO_BYTES, b"\0")
-        elif self._partial_samples[slot].add_pdo(pdo, data, arrival_ns):
-            self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = self._partial_samples[slot].data
+            place = slice(slot * _SAMPLE_BYTES, slot * _SAMPLE_BYTES + PDO_BYTES)
+            data = data.ljust(PDO_BYTES, b"\0")
+            if self._fresh[slot] and self._bytes[place] != data:
+                self._contrary[slot] = 1
+            self._bytes[place] = data
         else:
-            return
+            parts = self._partial_samples[slot]
+            if parts.contradicts(pdo, data):
+                self._contrary[slot] = 1
+            if not parts.add_pdo(pdo, data, arrival_ns):
+                return
+            self._bytes[slot * _SAMPLE_BYTES : (slot + 1) * _SAMPLE_BYTES] = parts.data
         self._arrival_ns[slot] = arrival_ns
         if self._fresh[slot]:
             self._repeat_counts[slot] += 1
@@ -255,6 +265,11 @@ class _PartialSample:
         self._last_arrival_ns: dict[int, int] = {}
         self._mixes_cycles = False
 
+    def contradicts(self, pdo: int, data: bytes | bytearray) -> bool:
+        """Return True if this PDO has arrived in this cycle with other data."""
+        start = pdo * PDO_BYTES
+        return pdo in self._last_arrival_ns and self.data[start : start + len(data)] != data
+
     def add_pdo(self, pdo: int, data: bytes | bytearray, arrival_ns: int) -> bool:
         """Store a PDO; return True when the sample is complete and of one SYNC."""
         start = pdo * PDO_BYTES
@@ -297,6 +312,11 @@ class _ScheduledSample:
         self._cycle = 0
         self._cycle_of: dict[int, int] = {}  # PDO -> cycle of its last arrival
         self._arrival_ns: dict[int, int] = {}
+
+    def contradicts(self, pdo: int, data: bytes | bytearray) -> bool:
+        """Return True if this PDO has arrived in this cycle with other data."""
+        start = pdo * PDO_BYTES
+        return self._cycle_of.get(pdo) == self._cycle and self.data[start : start + len(data)] != data
 
     def add_pdo(self, pdo: int, data: bytes | bytearray, arrival_ns: int) -> bool:
         """Store a PDO; return True when those of all states are of consecutive cycles, the last this one."""

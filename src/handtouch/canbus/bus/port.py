@@ -54,6 +54,7 @@ class Port:
 
     `echoes`: sent frames are received, too.
     `last_sync_ns` : time of the last SYNC sent or received, 0 before the first; `Sync` sets it
+    `other_syncs` : SYNCs of other producers than this host; `Sync` counts them once a second
     `received_until_ns` : all frames that arrived before this time have been read by `drain`
     """
 
@@ -63,7 +64,7 @@ class Port:
         self.bus = bus
         self.router = Router(slab, BusState(bus.interface, str(bus.channel)))
         self.echoes = bus.interface in _ECHOING_INTERFACES
-        self.last_sync_ns = self.received_until_ns = 0
+        self.last_sync_ns = self.received_until_ns = self.other_syncs = 0
         self._receiver = receiver
         self._send_lock = threading.Lock()
         self._was_bus_off = False

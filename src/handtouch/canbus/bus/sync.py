@@ -192,7 +192,7 @@ class Sync:
             if bus.kernel_sender is None
             else "kernel",
             "jitter_us": bus.jitter.percentiles_us(now_ns),
-            "other_syncs": bus.other_syncs,
+            "other_syncs": bus.port.other_syncs,
             "problem": bus.problem,
         }
 
@@ -239,7 +239,6 @@ class _SyncBus:
         self.kernel_sender: CyclicSender | None = None
         self.jitter = SyncJitter()
         self.kernel_retry_ns = 0
-        self.other_syncs = 0
         self.problem = ""
         self._window_start_ns = self._received_syncs = self._sent_syncs = 0
 
@@ -303,7 +302,7 @@ class _SyncBus:
         elif self.port.echoes:
             ours = self._sent_syncs + _WINDOW_TOLERANCE_SYNCS
         others = max(0, self._received_syncs - ours)
-        self.other_syncs += others
+        self.port.other_syncs += others
         if others and self.problem != _OTHER_PRODUCER_PROBLEM:
             _log.warning("bus %s: %s", self.port.name, _OTHER_PRODUCER_PROBLEM)
         if others or self.kernel_sender is not None or self.problem == _OTHER_PRODUCER_PROBLEM:

@@ -56,6 +56,10 @@ _BABBLING_REASON = (
     "babbling: it sends {} samples per SYNC, or another device sends with its COB-ID; "
     "power-cycle or unplug it"
 )
+_CONTRARY_REASON = (
+    "two different samples per SYNC: another device sends with its COB-ID, or has its node id; unplug one, "
+    "or give it another COB-ID or id"
+)
 _SETTINGS_UNCHANGED = "its PDO and heartbeat settings are as configured; check its sampling and firmware"
 _STANDBY_REASON = "outside the scene: in standby until needed"
 
@@ -92,8 +96,8 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             return _on_identifier_clash(life, reason, now_ns, timing)
         case HeartbeatRate(doubled):
             return _on_heartbeat_rate(life, doubled, now_ns, timing)
-        case SampleRate(samples_per_sync):
-            return _on_sample_rate(life, samples_per_sync, now_ns, timing)
+        case SampleRate():
+            return _on_sample_rate(life, event, now_ns, timing)
         case StandbyRequested(standby):
             return _on_standby_requested(life, standby, now_ns, timing)
         case TimerExpired():
@@ -385,13 +389,16 @@ def _on_identifier_clash(life: Lifecycle, reason: str, now_ns: int, timing: Node
     return life, (NodeAction.ENTER_PREOPERATIONAL,) if timing.role is BusRole.MASTER else ()
 
 
-def _on_sample_rate(life: Lifecycle, samples_per_sync: int, now_ns: int, timing: NodeTiming) -> Transition:
-    if not samples_per_sync:
+def _on_sample_rate(life: Lifecycle, rate: SampleRate, now_ns: int, timing: NodeTiming) -> Transition:
+    if not rate.samples_per_sync:
         return life._replace(babbling=False, due_ns=now_ns if life.babbling else life.due_ns), ()
-    # another master may configure any transmission
-    if life.state not in STARTED or timing.role is not BusRole.MASTER:
+    if life.state not in STARTED or timing.role is BusRole.LISTENER:
         return life, ()
-    life = enter(life, NodeState.FAULTED, now_ns, _BABBLING_REASON.format(samples_per_sync))
+    # another master may configure any transmission
+    if timing.role is BusRole.GUEST and not rate.is_contrary:
+        return life, ()
+    reason = _CONTRARY_REASON if rate.is_contrary else _BABBLING_REASON.format(rate.samples_per_sync)
+    life = enter(life, NodeState.FAULTED, now_ns, reason)
     return life._replace(babbling=True, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns), ()
 
 

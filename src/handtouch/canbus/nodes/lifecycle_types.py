@@ -207,9 +207,13 @@ class HeartbeatRate:
 
 @dataclass(frozen=True, slots=True)
 class SampleRate:
-    """Samples per SYNC over a window; 0 for the regular one."""
+    """Samples per SYNC over a window; 0 for the regular one.
+
+    `is_contrary`: in most cycles there were two of different contents, as of two devices.
+    """
 
     samples_per_sync: int
+    is_contrary: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,6 @@ from handtouch.canbus.nodes.lifecycle_types import (
     NodeAction,
     NodeState,
     ProbeAnswered,
-    SampleRate,
     SampleReceived,
     SamplesMissing,
     StandbyRequested,
@@ -179,8 +178,8 @@ class Master:
             self._collect_results(now_ns)
         self._check_recoveries(now_ns)
         self._check_samples(now_ns)
-        for slot, samples_per_sync in self._sample_rates.check(now_ns).items():
-            self._advance(self._by_slot[slot], SampleRate(samples_per_sync), now_ns)
+        for slot, rate in self._sample_rates.check(now_ns).items():
+            self._advance(self._by_slot[slot], rate, now_ns)
         if now_ns >= self._next_due_ns:
             self._run_timers(now_ns)
 

@@ -5,8 +5,9 @@ cdef Py_ssize_t _HEADER, _FRAME, _CONTROL, _ROUTE, _FIELD, _PACKET, _PATTERN, _D
 cdef Py_ssize_t _CONTROL_SIZE, _MESSAGE_SIZE, _STAMP_BYTES, _FRAME_BYTES, _IDENTIFIERS, _WORDS_OF_SLOT
 
 cdef class SampleMemory:
-    cdef long long[::1] words, arrival_ns, repeat_counts, counts, fields, low_limits, high_limits
-    cdef unsigned char[::1] fresh, single
+    cdef long long[::1] words, arrival_ns, repeat_counts, contrary_counts
+    cdef long long[::1] counts, fields, low_limits, high_limits
+    cdef unsigned char[::1] fresh, single, contrary
     cdef readonly Py_ssize_t channels, new_fresh, stored_bytes
 
 cdef class FrameBatch:

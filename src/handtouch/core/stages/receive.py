@@ -32,11 +32,12 @@ _LOW_HALF = 0xFFFFFFFF
 class SampleMemory:
     """Memory of a slab; a row a slot.
 
-    words: (slots WORDS_OF_SLOT,) PDOs. arrival_ns, repeat_counts: (slots,). fresh: (slots,). single:
-    (slots,), 1 where a sample is one PDO. `new_fresh` and `stored_bytes` are those of the last call of
-    `store_samples`. counts: (slots channels,), written by `unpack_counts`; of each, low_limits and
-    high_limits, at which a channel is saturated, and fields (slots channels FIELD_WORDS,): index of its word,
-    first bit, mask of its bits, and the value of its sign bit, 0 without sign.
+    words: (slots WORDS_OF_SLOT,) PDOs. arrival_ns, repeat_counts, contrary_counts: (slots,). fresh: (slots,).
+    single, contrary: (slots,), 1 where a sample is one PDO, and where two differed in this cycle.
+    `new_fresh` and `stored_bytes` are those of the last call of `store_samples`. counts: (slots channels,),
+    written by `unpack_counts`; of each, low_limits and high_limits, at which a channel is saturated, and
+    fields (slots channels FIELD_WORDS,): index of its word, first bit, mask of its bits, and the value of its
+    sign bit, 0 without sign.
     """
 
     def __init__(
@@ -44,8 +45,10 @@ class SampleMemory:
         words: memoryview[int],
         arrival_ns: memoryview[int],
         repeat_counts: memoryview[int],
+        contrary_counts: memoryview[int],
         fresh: memoryview[int],
         single: memoryview[int],
+        contrary: memoryview[int],
         counts: memoryview[int],
         fields: memoryview[int],
         low_limits: memoryview[int],
@@ -55,7 +58,8 @@ class SampleMemory:
         self.channels = len(counts) // max(len(arrival_ns), 1)
         self.low_limits, self.high_limits = low_limits, high_limits
         self.words, self.arrival_ns, self.repeat_counts = words, arrival_ns, repeat_counts
-        self.fresh, self.single = fresh, single
+        self.contrary_counts = contrary_counts
+        self.fresh, self.single, self.contrary = fresh, single, contrary
         self.new_fresh = self.stored_bytes = 0
 
 
@@ -142,6 +146,8 @@ def store_samples(
         length = head >> 32 & 0xFF
         if slot < 0 or length < size or length > _DATA_BYTES or not memory.single[slot]:
             return i
+        if memory.fresh[slot] and memory.words[_WORDS_OF_SLOT * slot] != batch.frames[_FRAME * i + 1]:
+            memory.contrary[slot] = 1
         memory.words[_WORDS_OF_SLOT * slot] = batch.frames[_FRAME * i + 1]
         memory.arrival_ns[slot] = frame_arrival_ns(batch, i)
         if memory.fresh[slot]:
@@ -157,6 +163,8 @@ def begin_cycle(memory: SampleMemory, sync_ns: int) -> int:
     """Mark the samples that arrived since a SYNC as fresh; return their number."""
     count = 0
     for slot in range(len(memory.arrival_ns)):
+        memory.contrary_counts[slot] += memory.contrary[slot]
+        memory.contrary[slot] = 0
         memory.fresh[slot] = 1 if memory.arrival_ns[slot] >= sync_ns else 0
         count += memory.fresh[slot]
     return count
