@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
+import can
 import pytest
 
 from handtouch.canbus.bus.port import Port
@@ -89,3 +90,56 @@ def test_extra_sync_producer_does_not_make_nodes_babbling(make_rig: Any, size: i
 def test_node_configured_by_another_master_may_send_at_any_rate(role: BusRole) -> None:
     life = Lifecycle(state=OPERATIONAL)
     assert advance(life, SampleRate(11), 0, NodeTiming(100 * MS, 350 * MS, role)) == (life, ())
+
+
+OTHERS = b"\x20\x03" * 4
+
+
+def with_another_device(rig: Any, cycles: int, data: bytes = OTHERS) -> list[Any]:
+    """Run SYNC periods in each of which another device, too, sends with the COB-ID of node 1."""
+    events = []
+    for _ in range(cycles):
+        rig.inject(0x281, data)
+        events += rig.run(5)
+    return events
+
+
+@pytest.mark.parametrize("size", [1, 3])
+@pytest.mark.parametrize("role", ["master", "guest"])
+def test_node_whose_cob_id_another_device_has_is_faulted_until_that_is_gone(
+    make_rig: Any, size: int, role: str
+) -> None:
+    rig = make_rig(size, role=role)
+    rig.plug_all()
+    rig.start()
+    for _ in range(3):
+        rig.run(100)
+        rig.nmt(1, 0)
+    rig.run(200)
+    assert rig.state(1) is OPERATIONAL
+    with_another_device(rig, 600)
+    assert [rig.state(n) for n in range(1, size + 1)] == [FAULTED, *[OPERATIONAL] * (size - 1)]
+    assert "two different samples per SYNC: another device sends with its COB-ID" in rig.status(1).reason
+    assert [e for e in with_another_device(rig, 1200) if e.slot == 0] == []  # once
+    rig.run(7000)
+    assert rig.state(1) is OPERATIONAL
+
+
+def test_what_two_devices_send_alike_contradicts_nothing(make_rig: Any) -> None:
+    rig = make_rig(1)
+    rig.boot()
+    assert with_another_device(rig, 600, rig.counts[0].astype("<i2").tobytes()) == []
+
+
+def test_samples_on_syncs_of_another_producer_are_not_those_of_another_device(make_rig: Any) -> None:
+    rig = make_rig(1)
+    rig.boot()
+    events = []
+    for cycle in range(1200):
+        events += rig.run(2)
+        rig.counts[:] += 1
+        rig.devices.handle_frame(can.Message(arbitration_id=0x80, is_extended_id=False), rig.t_ns)
+        events += rig.run(3)
+        rig.counts[:] -= 1
+        rig.port.other_syncs += 200 * (cycle % 200 == 199)
+    assert events == []

@@ -74,6 +74,15 @@ def test_node_in_standby_is_switched_off_and_stopped_and_still_supervised(rig: A
     assert rig.state(1) is ABSENT
 
 
+def test_event_driven_node_may_send_different_samples_in_a_sync_period(rig: Any) -> None:
+    pace(rig, 1, True)
+    rig.run(50)
+    for _ in range(600):
+        rig.inject(0x281, b"\x20\x03" * 4)
+        rig.inject(0x281, b"\x10\x03" * 4)
+        assert rig.run(5) == []
+
+
 def test_node_that_reboots_in_standby_stays_in_standby(rig: Any) -> None:
     rest(rig, 1, True)
     rig.run(50)
