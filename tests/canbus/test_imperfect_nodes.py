@@ -117,3 +117,18 @@ def test_slow_heartbeat_is_measured_and_its_remedy_named(make_rig: Make) -> None
     assert rig.state(1) is OPERATIONAL
     assert "instead of 100 ms" in rig.status(1).reason
     assert "raise heartbeat_timeout_ms" in rig.status(1).reason
+
+
+def test_heartbeat_slowed_by_another_client_is_repaired_once_the_node_answers(make_rig: Make) -> None:
+    """It beats every second when its settings can be read again, and the pad is used all the time."""
+    rig = make_rig(2)
+    rig.boot()
+    rig.node(1).write_object(0x1017, 0, 1000)
+    rig.node(1).sdo.frozen = True
+    rig.run(2500)
+    assert "slow heartbeat: every 1000 ms instead of 100 ms" in rig.status(1).reason
+    rig.node(1).sdo.frozen = False
+    rig.run(6000)
+    assert rig.node(1).read_object(0x1017, 0) == 100
+    assert [rig.state(n) for n in (1, 2)] == [NodeState.OPERATIONAL] * 2
+    assert rig.status(1).reason == ""

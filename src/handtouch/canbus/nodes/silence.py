@@ -124,12 +124,11 @@ def on_heartbeat_timeout(
 def on_slow_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Handle a heartbeat that is late while the node's samples arrive: it is present.
 
-    Where none comes at all, its heartbeat time may have been changed: the settings are checked.
+    Its heartbeat time may have been changed: the settings are checked, and again at intervals.
     """
     life = life._replace(last_heartbeat_ns=now_ns, is_heartbeat_slow=True)
     life = _with_heartbeat_reason(life, timing)
-    is_measured = life.heartbeat_gap_ns > timing.heartbeat_timeout_ns
-    if timing.role is BusRole.LISTENER or is_measured or now_ns - life.check_ns <= timing.max_retry_ns:
+    if timing.role is BusRole.LISTENER or now_ns - life.check_ns <= timing.max_retry_ns:
         return life, ()
     return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
 
