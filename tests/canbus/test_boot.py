@@ -363,6 +363,24 @@ def test_answers_of_a_server_one_request_behind_are_taken_for_the_requests_they_
     assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
 
 
+def test_second_answer_of_two_nodes_with_one_id_is_no_answer_to_the_next_request() -> None:
+    """It is passed on when its request has ended but the next one hasn't begun, or just as that begins."""
+    node = Node(identity(7) | {(0x1017, 0): (100, 2)})
+    plain = node.answer
+    second = b""
+
+    def twice(can_id: int, data: bytes) -> bool:
+        nonlocal second
+        if second:
+            node.transport._client.on_response(0, second, 0.0)
+        second = bytes.fromhex("4318100107000000")
+        return plain(can_id, data)
+
+    node.intercept(twice)
+    assert node.sdo.read(0x1018, 1, "vendor id") == 7
+    assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
+
+
 def test_a_late_answer_to_an_earlier_request_starts_the_timeout_again() -> None:
     requests: list[bytes] = []
     answers = [bytes.fromhex("4318100107000000"), bytes.fromhex("4b17100064000000")]

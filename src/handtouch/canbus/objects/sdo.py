@@ -89,6 +89,7 @@ class _SdoClient(SdoClient):  # type: ignore[misc]  # canopen has no types
     """
 
     received_until_ns: Callable[[], int] | None = None
+    is_of_another_request: Callable[[bytes], bool]
     responded = False
     late_responses = 0
 
@@ -101,9 +102,11 @@ class _SdoClient(SdoClient):  # type: ignore[misc]  # canopen has no types
             except SdoCommunicationError:
                 if self.late_responses == late_before or self.late_responses > most:
                     raise
-            else:
+                continue
+            if not self.is_of_another_request(response) or self.late_responses > most:
                 self.responded = True
                 return response
+            self.late_responses += 1  # passed on while the request before it ended
 
     def _read_received(self) -> bytes:
         deadline_ns = time.monotonic_ns() + round(self.RESPONSE_TIMEOUT * 1e9)
@@ -144,6 +147,7 @@ class SdoTransport:
             cia301.SDO_REQUEST + node_id, cia301.SDO_RESPONSE + node_id, ObjectDictionary()
         )
         self._client.received_until_ns = received_until_ns
+        self._client.is_of_another_request = self._is_of_another_request
         self._client.network = self._network = _SdoNetwork(send)
         self._client.RESPONSE_TIMEOUT = self._timeout_s = SDO_TIMEOUT_S if timeout_s is None else timeout_s
         self.awaiting_response = False
