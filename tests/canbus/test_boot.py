@@ -358,7 +358,7 @@ def test_answers_of_a_server_one_request_behind_are_taken_for_the_requests_they_
         return len(waiting) < 2 or data[0] == 0x80 or plain(can_id, waiting.pop(0))
 
     node.intercept(behind)
-    node.sdo.write_if_different(0x1017, 0, 100, 2, "heartbeat time")
+    node.sdo.write_if_different(0x1017, 0, 100, "heartbeat time")
     assert node.objects[0x1017, 0] == (100, 2)
     assert node.sdo.read(0x1017, 0, "heartbeat time") == 100
 

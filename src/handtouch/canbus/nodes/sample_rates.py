@@ -19,11 +19,11 @@ from handtouch.core.slab import Slab
 MAX_EXTRA_SAMPLES_PER_SYNC = 2
 """Samples beyond one per SYNC from which a node counts as babbling; duplicated frames cause one at most."""
 _MOST_CYCLES = 0.5
-"""Part of the cycles with two different samples; samples that come late by about a period cause half."""
+"""Part of the cycles with two different samples that is a fault; ones late by a period cause half."""
 _WINDOW_NS = 500_000_000
 _CONTRARY_WINDOWS, _LONE_CONTRARY_WINDOWS = 2, 4
-"""In a row, before two devices are reported. SYNCs of another producer, which have the same effect on a lone
-node, are counted once a second."""
+"""Windows in a row before two devices are reported. SYNCs of another producer, which have the same effect on
+a lone node, are counted once a second."""
 
 
 @dataclass(slots=True, eq=False)

@@ -35,7 +35,7 @@ _COMMAND_MASK, _ABORT = 0xE0, 0x80
 _UPLOAD, _DOWNLOAD = 0x40, 0x60
 _COMMANDS_WITH_OBJECT = (_UPLOAD, _DOWNLOAD, _ABORT)  # responses with index and sub-index
 _INITIATE_RESPONSES = {0x40: _UPLOAD, 0x20: _DOWNLOAD}
-"""By the command of the request; that of a segment has none of them."""
+"""Command of the first response, by that of the request; a segment's isn't one of them."""
 _NO_OBJECT_ABORT_CODES = frozenset({0x06020000, 0x06090011, 0x060A0023, 0x08000024})
 
 
