@@ -33,6 +33,9 @@ settings.load_profile("shared cores")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 ROOT = Path(__file__).parents[1]
+# tables of pads are named by the hash of their parameters and code: all workers and sessions share them
+os.environ["XDG_CACHE_HOME"] = str(ROOT / "build/tests")
+COMPILED_AGAIN = "tables"
 BUILDS_WHEEL = "test_packaging.py"
 
 
@@ -50,10 +53,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Daemons of tests keep calibrations of simulated units, and tables, outside the user's folders."""
+    """Daemons of tests keep calibrations of simulated units outside the user's folder."""
     with pytest.MonkeyPatch.context() as changed:
-        for kind in ("STATE", "CACHE"):
-            changed.setenv(f"XDG_{kind}_HOME", str(tmp_path_factory.mktemp(kind.lower())))
+        changed.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
 
 
@@ -184,14 +186,46 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[
     return made
 
 
+def copy_compiled(source: Path) -> None:
+    """Save a source tree half a minute of the compiler: the stages compiled here, but one that it compiles.
+
+    Their names carry the hash of their sources, so that others are none.
+    """
+    here = ROOT / "src/handtouch/core/stages/_compiled"
+    if here.exists():
+        shutil.copytree(
+            here,
+            source / here.relative_to(ROOT),
+            ignore=shutil.ignore_patterns("tolerances-*", "__pycache__"),
+        )
+
+
 @pytest.fixture(scope="session")
 def archives(shared: Callable[[str, Callable[[Path], None]], Path]) -> Path:
     """Folder with the source archive, and the wheel built from it."""
 
-    def build(folder: Path) -> None:
-        command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+    def run_build(source: Path, kind: str, folder: Path) -> None:
+        command = [
+            sys.executable,
+            "-m",
+            "build",
+            "--no-isolation",
+            kind,
+            "--outdir",
+            str(folder),
+            str(source),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
+
+    def build(folder: Path) -> None:
+        run_build(ROOT, "--sdist", folder)
+        (archive,) = folder.glob("*.tar.gz")
+        subprocess.run(["tar", "-xzf", archive, "-C", folder], check=True)
+        source = folder / archive.name.removesuffix(".tar.gz")
+        copy_compiled(source)
+        run_build(source, "--wheel", folder)
+        shutil.rmtree(source)
 
     return shared("dist", build)
 

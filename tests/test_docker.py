@@ -21,7 +21,7 @@ import yaml
 from handtouch.cli import build_parser
 from handtouch.core.compiled import STAGES
 
-from .conftest import ROOT, Installation
+from .conftest import ROOT, Installation, copy_compiled
 
 pytestmark = pytest.mark.timeout(900)  # the first of these tests waits for a wheel, which compiles
 
@@ -112,8 +112,7 @@ def test_the_build_stage_makes_a_compiled_wheel(tmp_path: Path) -> None:
     copy_context(build, tmp_path, workdir, None)
     folder = "src/handtouch/core/stages/_compiled"
     assert not (tmp_path / workdir / folder).exists()  # compiled for the host's C library
-    if (ROOT / folder).exists():  # saves half a minute of the compiler
-        shutil.copytree(ROOT / folder, tmp_path / workdir / folder)
+    copy_compiled(tmp_path / workdir)
     installs, script = [rest for name, rest in build if name == "RUN" and "pip" in rest]
     assert "--require-hashes" in installs
     assert script.startswith("HANDTOUCH_REQUIRE_COMPILED=1 python -m pip wheel ")

@@ -14,10 +14,10 @@ from handtouch.calibration.auto_calibration import AutoCalibrator, new_gain_esti
 from handtouch.calibration.gains import BATCH_CONTACTS
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import load, shipped
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
 from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import Rectangle
 from handtouch.wire import PadState
 
@@ -65,7 +65,7 @@ def test_a_benchmarks_pipeline_computes_what_the_daemons_does(tmp_path: Path) ->
     local = {name: f"ipc://{tmp_path}/{name}" for name in ("live", "complete", "control", "inputs")}
     buses = tuple(bus.model_copy(update={"interface": "virtual"}) for bus in whole.buses)
     deployment = whole.model_copy(update={"daemon": whole.daemon.model_copy(update=local), "buses": buses})
-    daemon = HandtouchDaemon.open(deployment, PadModel(deployment))
+    daemon = HandtouchDaemon.open(deployment, build_pad_model(deployment))
     try:
         own, theirs = daemon.pipeline, pipeline_of(deployment, NoSubscriber())
         cycles = [(p.cycle.period_ns, p.cycle.window_ns) for p in (own, theirs)]
@@ -85,7 +85,7 @@ def test_a_benchmarks_pipeline_computes_what_the_daemons_does(tmp_path: Path) ->
 
 def test_a_benchmark_of_touches_has_the_contact_of_every_touched_pad() -> None:
     deployment = load(shipped.path("utah_mit.toml"))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
     counts = np.zeros((TICKS, model.size, 4), np.int64)
     counts[10:, :2] = 200
     contacts = serve(model, deployment, counts, {TICKS - 1: 7})

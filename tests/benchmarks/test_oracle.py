@@ -13,7 +13,7 @@ from benchmarks.oracle import OracleCovariances, PadOracle
 from handtouch import config
 from handtouch.config import load, shipped
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
-from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -66,7 +66,7 @@ def covariances(
     deployment: config.Deployment, drawn: DrawnWorld, found: list[GroundTruth], contacts_before: int = 0
 ) -> OracleCovariances:
     ((hand, pad),) = deployment.pads
-    noise_a = PadModel(deployment).noise_a[0]
+    noise_a = build_pad_model(deployment).noise_a[0]
     oracle = PadOracle.build(drawn, deployment, hand, pad, noise_a)
     if contacts_before:
         place = np.random.default_rng(1).uniform(0.1, 0.9, (2, contacts_before))
@@ -95,7 +95,7 @@ def test_it_evaluates_at_the_true_parts(deployment: config.Deployment) -> None:
     known = replace(drawn, world=World("known"))
     oracle = PadOracle(
         pad, deployment.sheets[pad.sheet], drawn.pad(hand, pad), deployment.nodes[pad.node].drive_v,
-        PadModel(deployment).noise_a[0], {},
+        build_pad_model(deployment).noise_a[0], {},
     )  # fmt: skip
     u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
     stated = oracle.covariances(u, v, np.full(len(found), FORCE_N))
@@ -156,7 +156,7 @@ def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment:
     drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.TUNING.seed(4))
     described = drawn.describe(deployment)
     ((hand_name, pad),) = described.pads
-    model, touches = PadModel(described), draw_touches(["index_distal"], 80, drawn.seed)
+    model, touches = build_pad_model(described), draw_touches(["index_distal"], 80, drawn.seed)
     hand = VirtualHand(described, Scenario(touch=touches), drawn)
     (learnt,) = learn(hand, described, model, 0, range(80), (32,))
     assert learnt.calibration is not None

@@ -6,7 +6,7 @@ import pytest
 
 from handtouch.cli.demo_rate import solving_time_s, sustained_period_ms
 from handtouch.config import parse
-from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from tests.deployments import SIX_ARCS, arcs_text
 
 
@@ -21,4 +21,4 @@ def test_period_is_doubled_until_a_quarter_of_it_suffices_within_the_range_of_de
 
 
 def test_contacts_on_pads_with_different_numbers_of_electrodes_are_timed() -> None:
-    assert solving_time_s(PadModel(parse(arcs_text(SIX_ARCS)))) > 0
+    assert solving_time_s(build_pad_model(parse(arcs_text(SIX_ARCS)))) > 0

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import Deployment, parse
 from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from tests.deployments import CYLINDER, deployment_text, pad_text
 from tests.exact_pads import ExactPads
 
@@ -44,5 +45,5 @@ class Bench:
 @pytest.fixture(scope="session")
 def bench() -> Bench:
     deployment = parse(DEPLOYMENT)
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
     return Bench(deployment, model, ExactPads(deployment, model))

@@ -8,12 +8,12 @@ import sys
 import numpy as np
 
 from handtouch.config import parse
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Cycle, Slab
 from handtouch.core.stages import detect
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import ContactMessageEncoder
+from handtouch.daemon.table_cache import build_pad_model
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
 PERIOD_NS = 5_000_000
@@ -27,7 +27,7 @@ hysteresis_width = 0.1
 def main(count: int) -> None:
     """Run ticks with contacts, noise, missing, late and saturated samples, and pads that aren't up."""
     rng = np.random.default_rng(8)
-    model = PadModel(parse(TOLERANT_DEPLOYMENT + BEHAVIOUR))
+    model = build_pad_model(parse(TOLERANT_DEPLOYMENT + BEHAVIOUR))
     slab, cycle, tick = Slab(model.size), Cycle(PERIOD_NS, 0.6), TickProcessor(model, PERIOD_NS)
     slab.set_layout(1, (ChannelField(0, 0, 16, signed=False), *STANDARD_LAYOUT[1:]))
     encoder = ContactMessageEncoder(model, tick, session=7)

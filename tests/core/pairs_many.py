@@ -9,15 +9,15 @@ import numpy as np
 
 from handtouch.config import load, shipped
 from handtouch.core.contact_solver import PARTS_COUNT, VALUE_COUNT, make_solver
-from handtouch.core.pad_model import PadModel
 from handtouch.core.stages import solve
+from handtouch.daemon.table_cache import build_pad_model
 
 _PAD = 1
 
 
 def main(count: int) -> None:
     """Solve pairs anywhere on the pad, a twentieth of `count` of them: each is fitted from many starts."""
-    rng, model = np.random.default_rng(11), PadModel(load(shipped.path("electrodes.toml")))
+    rng, model = np.random.default_rng(11), build_pad_model(load(shipped.path("electrodes.toml")))
     network, pads = model.networks[_PAD], model.size
     currents, values = np.zeros((pads, 6)), np.full((pads, VALUE_COUNT), np.nan)
     parts = np.full((pads, PARTS_COUNT), np.nan)

@@ -11,15 +11,15 @@ from handtouch.calibration.calibration import LawParameters
 from handtouch.config import parse
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
-from handtouch.core.pad_model import PadModel
 from handtouch.core.slip import SlipDetector
 from handtouch.core.stages import solve
+from handtouch.daemon.table_cache import build_pad_model
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
 
 def main(count: int) -> None:
     """Solve contacts of any force that move, jump, and are no points, on pads calibrated and not."""
-    rng, model = np.random.default_rng(7), PadModel(parse(TOLERANT_DEPLOYMENT))
+    rng, model = np.random.default_rng(7), build_pad_model(parse(TOLERANT_DEPLOYMENT))
     n = model.size
     covariance = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.01))
     law = LawParameters(20000.0, 1.4, 2400.0, covariance, 2.0)

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from handtouch.config import Deployment, parse
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
-from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import Rectangle
 from handtouch.simulate.current_crowding import crowding, solve_disc
 from tests.deployments import deployment_text, pad_text
@@ -67,7 +67,7 @@ def solved_currents(x_mm: float, y_mm: float, force_n: float, tilt: float = 0.0)
 
 def located_mm(currents_a: FloatArray, crowded: bool = True) -> tuple[FloatArray, float]:
     """Return position [mm] and standard deviation [mm] of a contact with these currents (4,)."""
-    model, values = PadModel(deployment(crowded)), np.full((1, VALUE_COUNT), np.nan)
+    model, values = build_pad_model(deployment(crowded)), np.full((1, VALUE_COUNT), np.nan)
     make_solver(model, currents_a[None], np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
         np.arange(1).data
     )

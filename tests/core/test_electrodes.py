@@ -18,6 +18,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.state import TickState
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ContactLaw
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.outline_surface import OutlineSurface
@@ -27,7 +28,7 @@ from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
 
 @pytest.fixture(scope="module")
 def model() -> PadModel:
-    return PadModel(parse(arcs_text()))
+    return build_pad_model(parse(arcs_text()))
 
 
 def test_fractions_of_arcs_are_those_of_the_outline_itself() -> None:
@@ -104,7 +105,7 @@ def solved(model: PadModel, fractions: NDArray[np.float64], total_a: float) -> N
 
 def test_contacts_are_located_without_a_dead_electrode() -> None:
     deployment = parse(arcs_text(SIX_ARCS))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
     network, sheet, whole = model.networks[1], deployment.sheets["s"], model.calibrations[1]
     at = np.array([0.35, 0.62]) * (network.a, network.b)
     floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
@@ -163,7 +164,7 @@ def test_raw_counts_have_as_many_columns_as_the_pad_with_most_electrodes(
     arcs: dict[str, tuple[float, float]],
 ) -> None:
     sink, now_ns = RawMessages(), 10**9
-    pipeline = Pipeline(PadModel(parse(arcs_text(arcs))), 5_000_000, 0.6, sink)
+    pipeline = Pipeline(build_pad_model(parse(arcs_text(arcs))), 5_000_000, 0.6, sink)
     pipeline.begin_cycle(now_ns, now_ns)
     for pad, count in enumerate((4, len(arcs))):
         pipeline.slab.set_layout(
@@ -180,7 +181,7 @@ def test_raw_counts_have_as_many_columns_as_the_pad_with_most_electrodes(
 
 def test_a_loaded_state_continues_without_its_dead_electrode() -> None:
     deployment = parse(arcs_text(SIX_ARCS))
-    network = PadModel(deployment).networks[1]
+    network = build_pad_model(deployment).networks[1]
     floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
     counts = np.rint(8000 * floating.fractions(0.4 * network.a, 0.6 * network.b)).astype("<i2")
 
@@ -194,7 +195,7 @@ def test_a_loaded_state_continues_without_its_dead_electrode() -> None:
         return np.array(pipeline.tick.columns.values[1])
 
     def started() -> Pipeline:
-        made = Pipeline(PadModel(deployment), 5_000_000, 0.6, RawMessages())
+        made = Pipeline(build_pad_model(deployment), 5_000_000, 0.6, RawMessages())
         made.node_state[:] = wire.PadState.CLEAR
         made.slab.set_layout(1, tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(6)))
         return made

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -60,7 +61,7 @@ def elongated_at_an_edge(elongation_std: float, count: int) -> tuple[FloatArray,
         hand.solve_contacts(np.zeros(1, np.intp), position[:, [k]], patch[:, [k]], np.ones(1))[0][0]
         for k in range(count)
     ]
-    model = PadModel(stated)
+    model = build_pad_model(stated)
     found = solve(model, np.array(single))
     return (
         found["pad_m"][:, 0] - position[0] * length_m,
@@ -70,7 +71,7 @@ def elongated_at_an_edge(elongation_std: float, count: int) -> tuple[FloatArray,
 
 def test_current_that_hangs_over_an_edge_enters_at_the_edge() -> None:
     stated = deployed()
-    hand, model = virtual_hand(stated), PadModel(stated)
+    hand, model = virtual_hand(stated), build_pad_model(stated)
     length_m, _ = hand.virtual_pads[0].circuit.size_m
     along = np.cos(np.linspace(0, np.pi, 2001))
     density = np.sqrt(1 - along**2) * np.sqrt(1 - along**2)  # of the angle
@@ -96,7 +97,7 @@ def test_positions_of_elongated_contacts_that_hang_over_an_edge_hold() -> None:
 def test_the_force_of_two_patches_is_within_its_interval(total_n: float) -> None:
     two: list[dict[str, Any]] = [{"path": ((x, 0.5),), "force_n": (total_n / 2,)} for x in (0.25, 0.75)]
     deployment = deployed()
-    hand, model = virtual_hand(deployment, *two), PadModel(deployment)
+    hand, model = virtual_hand(deployment, *two), build_pad_model(deployment)
     counts = hand.counts(0, np.array([5.0]))
     found = solve(model, counts * model.ampere_per_count[0])
     assert found["squared_misfit"][0, 0] > 9.0
@@ -107,7 +108,7 @@ def test_the_force_of_two_patches_is_within_its_interval(total_n: float) -> None
 def test_two_patches_at_the_sheets_limit_give_a_bound_below_their_force() -> None:
     total_n = 60.0
     two: list[dict[str, Any]] = [{"path": ((x, 0.5),), "force_n": (total_n / 2,)} for x in (0.25, 0.75)]
-    hand, model = virtual_hand(deployed(), *two), PadModel(deployed())
+    hand, model = virtual_hand(deployed(), *two), build_pad_model(deployed())
     found = solve(model, hand.counts(0, np.array([5.0])) * model.ampere_per_count[0])
     assert found["force_status"][0, 0] == ForceEstimateStatus.LOWER_BOUND
     assert 0 < found["force_n"][0, 0] < total_n

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
 from handtouch.core.channel_currents import ChannelCurrents
-from handtouch.core.pad_model import PadModel, contact_law, law_of
+from handtouch.core.pad_model import contact_law, law_of
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.wire import ForceStatus, PadState, PositionStatus
 
@@ -30,7 +31,7 @@ class Hand:
 
     def __init__(self, seed: int) -> None:
         self.deployment = load(shipped.path("utah_mit.toml"))
-        self.model = PadModel(self.deployment)
+        self.model = build_pad_model(self.deployment)
         self.pads = [pad for _, pad in self.deployment.pads]
         self.surfaces = [pad_surface(pad) for pad in self.pads]
         self.size, self.rng = self.model.size, np.random.default_rng(seed)

@@ -13,6 +13,7 @@ from handtouch.config import parse
 from handtouch.core import pad_tables
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ContactLaw, ForceEstimateStatus
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
@@ -89,7 +90,7 @@ def solve_drawn(text: str, forces: FloatArray) -> tuple[FloatArray, FloatArray, 
 
     Law and radius of each are drawn from the tolerances of a deployment.
     """
-    model, rng = PadModel(parse(text)), np.random.default_rng(4)
+    model, rng = build_pad_model(parse(text)), np.random.default_rng(4)
     sheet, network = parse(text).sheets["s"], model.networks[0]
     fractions = network.fractions(network.a / 2, network.b / 2)
     spreading_m = float(network.spreading_radius(network.a / 2, network.b / 2))
@@ -155,7 +156,7 @@ def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(toleranc
 def test_no_current_gives_a_force_beyond_the_greatest_one(greatest_n: float, tolerances: str) -> None:
     text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {greatest_n}")
     text = text.replace("contact_radius_std_mm = 0.5", tolerances)
-    model = PadModel(parse(text))
+    model = build_pad_model(parse(text))
     fractions = model.networks[0].fractions(model.networks[0].a * 0.3, model.networks[0].b / 2)
     force, std, status = solve_each(model, np.geomspace(1e-5, 0.1, 300)[:, None] * fractions).T
     valid = status == ForceEstimateStatus.VALID
@@ -171,7 +172,7 @@ def test_no_current_gives_a_force_beyond_the_greatest_one(greatest_n: float, tol
 def test_no_force_is_valid_that_its_current_leaves_open_as_in_a_corner(
     greatest: str, corner: tuple[float, float]
 ) -> None:
-    model = PadModel(parse(TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\n{greatest}")))
+    model = build_pad_model(parse(TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\n{greatest}")))
     side_a, side_b = model.networks[0].a, model.networks[0].b
     currents = np.geomspace(1e-5, 2e-3, 60)[:, None]
     force, std, status = solve_each(

@@ -10,14 +10,15 @@ import pytest
 from handtouch.calibration.calibration import LawParameters
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
-from handtouch.core.pad_model import PadModel, contact_law, law_of
+from handtouch.core.pad_model import contact_law, law_of
+from handtouch.daemon.table_cache import build_pad_model
 from tests.procedures.test_calibrate import TRUE, Table, deployed, fitted, weights
 
 FORCES = np.array([0.3, 1.0, 2.0, 4.0])
 
 
 def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_sessions() -> None:
-    true, model = PadModel(deployed(**TRUE)), PadModel(deployed(contact_radius_std_mm=0.0))
+    true, model = build_pad_model(deployed(**TRUE)), build_pad_model(deployed(contact_radius_std_mm=0.0))
     network = true.networks[0]
     fractions = network.fractions(network.a / 2, network.b / 2)
     currents = np.zeros((1, 4))
@@ -42,7 +43,7 @@ def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_session
 def test_the_std_of_a_force_includes_the_covariance_of_a_calibrated_law(bench: Any) -> None:
     results = []
     for spread in (0.0, 0.2):
-        model = PadModel(bench.deployment)
+        model = build_pad_model(bench.deployment)
         covariance = tuple(map(tuple, np.diag([spread**2, 0.0, 0.0]).tolist()))
         law = LawParameters(20000.0, 1.5, 2400.0, covariance)
         model.set_calibration(0, ActiveCalibration("1-1", law=law))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import parse
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import ContactMessageEncoder, TickMessages
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.pads import rotation_from_rpy
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
@@ -26,7 +26,7 @@ UNSTATED = "mount_std_mm = 0.0\nmount_std_deg = 0.0\n"
 
 def messages(stated: str) -> tuple[wire.Contact, dict[str, NDArray[Any]]]:
     """Return the message of a contact on the first pad, and the columns of the hand's frame."""
-    model = PadModel(parse(TOLERANT_DEPLOYMENT.replace("[[hand]]\n", "[[hand]]\n" + stated)))
+    model = build_pad_model(parse(TOLERANT_DEPLOYMENT.replace("[[hand]]\n", "[[hand]]\n" + stated)))
     slab, cycle, tick = Slab(model.size), Cycle(PERIOD_NS, 0.6), TickProcessor(model, PERIOD_NS)
     network = model.networks[0]
     counts = network.fractions(0.8 * network.a, 0.3 * network.b) * 1e-3 / model.ampere_per_count[0]

@@ -15,6 +15,7 @@ from handtouch.core.contact_solver import PART_COUNT, PARTS_COUNT, VALUE_COUNT, 
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -52,7 +53,7 @@ def deployment(**sheet: float) -> config.Deployment:
 
 @pytest.fixture(scope="module")
 def model() -> PadModel:
-    return PadModel(deployment())
+    return build_pad_model(deployment())
 
 
 def solved(model: PadModel, currents: FloatArray) -> FloatArray:
@@ -121,7 +122,7 @@ def test_one_contact_is_reported_as_two_no_more_often_than_stated(model: PadMode
 
 
 def test_no_pair_is_reported_at_a_false_alarm_rate_of_zero() -> None:
-    never = PadModel(deployment(pair_false_alarm=0.0))
+    never = build_pad_model(deployment(pair_false_alarm=0.0))
     x, y = np.array([[0.2, 0.8]]), np.array([[0.5, 0.5]])
     assert np.isnan(solved(never, currents_of(never, x, y, np.full((1, 2), 2e-3)))).all()
 

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 
 from handtouch import wire
 from handtouch.config import parse
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.wire import PadState
 from tests.record.conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand
 
 REST = b"\0" * 8
-MODEL = PadModel(parse(DEPLOYMENT.replace("begin_samples = 2", "begin_samples = 4")))
+SLOW_TO_BEGIN = DEPLOYMENT.replace("begin_samples = 2", "begin_samples = 4")
 
 
 def make_hand() -> Hand:
     sink = CollectingSink()
-    return Hand(parse(DEPLOYMENT), Pipeline(copy.deepcopy(MODEL), PERIOD_NS, 0.6, sink, SESSION), sink)
+    model = build_pad_model(parse(SLOW_TO_BEGIN))
+    return Hand(parse(DEPLOYMENT), Pipeline(model, PERIOD_NS, 0.6, sink, SESSION), sink)
 
 
 def states(hand: Hand) -> list[int]:

@@ -15,6 +15,7 @@ from handtouch.config import parse
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import estimate
 from handtouch.field.contact_law import ForceEstimateStatus
 from tests.deployments import deployment_text, pad_text
@@ -247,7 +248,7 @@ def test_a_point_contact_has_the_covariance_of_its_noise(bench: Any) -> None:
 
 
 def test_contacts_on_a_pad_whose_electrodes_touch_are_located() -> None:
-    model = PadModel(parse(deployment_text(pad_text("link", 1, gap_mm=0.0))))
+    model = build_pad_model(parse(deployment_text(pad_text("link", 1, gap_mm=0.0))))
     (network,) = model.networks
     at = np.array([0.3, 0.6]) * (network.a, network.b)
     values = np.full((1, VALUE_COUNT), np.nan)

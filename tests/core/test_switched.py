@@ -17,6 +17,7 @@ from handtouch.core.contact_solver import (
 )
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -28,7 +29,7 @@ TOTAL_A = 2e-3
 
 @pytest.fixture(scope="module")
 def model() -> PadModel:
-    return PadModel(load(shipped.path("switched.toml")))
+    return build_pad_model(load(shipped.path("switched.toml")))
 
 
 def solve(model: PadModel, *samples: FloatArray, settled: int = 1) -> tuple[FloatArray, FloatArray]:
@@ -177,6 +178,6 @@ def test_the_calibration_id_changes_with_the_schedule_alone(model: PadModel) -> 
     other = deployment.model_copy(
         update={"hands": (hand.model_copy(update={"pads": (swapped, hand.pads[1])}),)}
     )
-    ids = PadModel(other).default_calibration_ids
+    ids = build_pad_model(other).default_calibration_ids
     assert ids[0] != model.default_calibration_ids[0]
     assert ids[1] == model.default_calibration_ids[1]

@@ -14,6 +14,7 @@ from handtouch.config import Deployment, parse
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import electrode_network, part_stds
@@ -32,7 +33,7 @@ def deployment() -> Deployment:
 
 @pytest.fixture(scope="module")
 def model(deployment: Deployment) -> PadModel:
-    return PadModel(deployment)
+    return build_pad_model(deployment)
 
 
 def other_network(
@@ -93,7 +94,7 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
 
 def test_learned_parts_replace_the_stated_tolerances(deployment: Deployment) -> None:
     """With gaps and aspect known as they are, positions are right; the touch error widens regions."""
-    rng, learned = np.random.default_rng(8), PadModel(deployment)
+    rng, learned = np.random.default_rng(8), build_pad_model(deployment)
     _, pad = deployment.pads[0]
     stds = part_stds(pad, deployment.nodes[pad.node], deployment.sheets[pad.sheet])
     offsets = np.zeros(len(stds))
@@ -122,14 +123,14 @@ def test_deployments_state_uneven_sheets_and_elongated_contacts(
     without = np.trace(solve(model, at)[0], axis1=1, axis2=2)
     for update in ({"unevenness_std": 0.05}, {"contact_elongation_std": 1.0}):
         sheets = {"s": deployment.sheets["s"].model_copy(update=update)}
-        wider = PadModel(deployment.model_copy(update={"sheets": sheets}))
+        wider = build_pad_model(deployment.model_copy(update={"sheets": sheets}))
         assert (np.trace(solve(wider, at)[0], axis1=1, axis2=2) > 1.1 * without).all(), update
 
 
 def test_regions_hold_for_parts_within_their_tolerances(deployment: Deployment, model: PadModel) -> None:
     """Of contacts on sixty hands, 93 to 98 % lie in the region of 95 %; with exact parts stated, fewer."""
     inside = {}
-    for name, stated in (("tolerant", model), ("exact", PadModel(parse(DEPLOYMENT)))):
+    for name, stated in (("tolerant", model), ("exact", build_pad_model(parse(DEPLOYMENT)))):
         rng = np.random.default_rng(3)
         distances = np.concatenate([squared_distances(deployment, stated, rng) for _ in range(60)])
         inside[name] = np.mean(distances < chi2.ppf(0.95, 2))
@@ -170,7 +171,7 @@ def test_two_contacts_along_a_side_are_no_point_and_their_covariance_includes_th
 def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_from_its_middle() -> None:
     exact = parse(DEPLOYMENT)
     sheets = {"s": exact.sheets["s"].model_copy(update={"size_std_mm": 0.5})}
-    model, unsized = PadModel(exact.model_copy(update={"sheets": sheets})), PadModel(exact)
+    model, unsized = build_pad_model(exact.model_copy(update={"sheets": sheets})), build_pad_model(exact)
     for x, expected_mm in ((0.5, 0.0), (0.75, 0.125), (0.9, 0.2)):
         at = np.full((3, 2), [x, 0.5])
         added = np.diagonal(solve(model, at)[0][0] - solve(unsized, at)[0][0])
@@ -219,7 +220,7 @@ def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
     """In its middle they have a plateau of probability, or two maxima."""
     long = '{ kind = "plane", length_mm = 80.0, width_mm = 20.0 }'
     deployment = parse(deployment_text(pad_text("long", 1, long)))
-    model, rng = PadModel(deployment), np.random.default_rng(2)
+    model, rng = build_pad_model(deployment), np.random.default_rng(2)
     currents, values, distances = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan), []
     exact = ExactPads(deployment, model)
     solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)

@@ -13,8 +13,8 @@ import numpy as np
 import handtouch
 from handtouch import wire
 from handtouch.config import parse
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.wire import PadState
 from tests.deployments import deployment_text, pad_text
 
@@ -35,7 +35,7 @@ class EncodingSink:
 
 def main() -> None:
     text = deployment_text(pad_text("plane", 1))
-    model = PadModel(parse(text.replace("[sheet.s]", "[sheet.s]\nbehaviour = {}")))
+    model = build_pad_model(parse(text.replace("[sheet.s]", "[sheet.s]\nbehaviour = {}")))
     pipeline = Pipeline(model, PERIOD_NS, 0.6, EncodingSink())
     pipeline.node_state[:] = PadState.CLEAR
     passed: set[str] = set()

@@ -22,8 +22,8 @@ from handtouch.calibration.calibration import (
 from handtouch.client import request
 from handtouch.config import ConfigError, Deployment, parse
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.pad_model import PadModel
 from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000
@@ -84,7 +84,7 @@ class Bench:
 
 @pytest.fixture
 def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
-    made = Bench(bench.deployment, PadModel(bench.deployment), endpoints)
+    made = Bench(bench.deployment, build_pad_model(bench.deployment), endpoints)
     for _ in range(5):
         made.tick()
     yield made
@@ -316,7 +316,7 @@ def test_stored_calibration_is_applied_whole_and_an_empty_one_restores_the_file(
     on_a = model.begin_threshold_a.copy()
     model.set_calibration(0, ActiveCalibration("7-1", (1.1, 0.9, 1.0, 1.0), law))
     assert (model.law(0), model.gains[0, 0]) == (law, 1.1)
-    new_model = PadModel(served.deployment)
+    new_model = build_pad_model(served.deployment)
     new_model.copy_calibrations(model)
     assert (new_model.law(0), new_model.begin_threshold_a[0]) == (law, model.begin_threshold_a[0])
     model.set_calibration(0, model.default_calibration(0))
@@ -383,7 +383,7 @@ def test_reload_sees_another_content_of_a_file_that_the_deployment_names(
     node = served.deployment.nodes["n"].model_copy(update={"eds": str(eds)})
     deployment = served.deployment.model_copy(update={"nodes": {"n": node}})
     endpoints = {stream: f"ipc://{tmp_path}/{stream}" for stream in ("live", "complete", "control", "inputs")}
-    bench = Bench(deployment, PadModel(deployment), endpoints)
+    bench = Bench(deployment, build_pad_model(deployment), endpoints)
     try:
         assert bench.ask("reload")["ok"]
         eds.write_text(eds.read_text(errors="replace") + "\n; changed\n")
@@ -402,7 +402,7 @@ def _change_sheet(served: Bench) -> None:
 
 def test_the_session_is_random_and_exact_as_a_double(served: Bench, tmp_path: Path) -> None:
     endpoints = {stream: f"ipc://{tmp_path}/{stream}" for stream in ("live", "complete", "control", "inputs")}
-    again = Bench(served.deployment, PadModel(served.deployment), endpoints)
+    again = Bench(served.deployment, build_pad_model(served.deployment), endpoints)
     sessions = [made.daemon.publisher.session for made in (served, again)]
     again.daemon.close()
     assert sessions[0] != sessions[1]

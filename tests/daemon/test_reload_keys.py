@@ -16,6 +16,7 @@ from handtouch.config.tables import TABLES, Idle
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.reload import find_changes, find_restart_changes
+from handtouch.daemon.table_cache import build_pad_model
 from tests.deployments import CYLINDER, deployment_text, pad_text
 from tests.record.conftest import PERIOD_NS, SESSION, CollectingSink, Hand
 
@@ -138,7 +139,7 @@ def models() -> list[tuple[Deployment, PadModel]]:
     """Return the deployment, and those in which something of the second pad differs, with their models."""
     texts = [DEPLOYMENT, *(DEPLOYMENT.replace(before, after) for before, after in CHANGES)]
     assert len(set(texts)) == len(texts)
-    return [(deployment, PadModel(deployment)) for deployment in map(parse, texts)]
+    return [(deployment, build_pad_model(deployment)) for deployment in map(parse, texts)]
 
 
 def _messages_of_first_pad(

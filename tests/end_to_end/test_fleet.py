@@ -17,6 +17,7 @@ import msgpack
 import pytest
 
 from handtouch import wire
+from tests.starter import Starter
 
 from .conftest import START_S, Rig
 
@@ -150,11 +151,12 @@ def networks() -> Iterator[tuple[list[str], list[list[str]]]]:
             keeper.communicate()
 
 
-def rig_in(folder: Path, prefix: list[str], port: int) -> Rig:
+def rig_in(folder: Path, starter: Starter, prefix: list[str], port: int) -> Rig:
     """A deployment with ipc endpoints of its own; what it prints and binds is in the folder."""
     folder.mkdir()
     endpoints = {stream: f"ipc://{folder}/{stream}" for stream in ("live", "complete", "control", "inputs")}
-    return Rig(folder, endpoints, prefix, [f"can0=udp_multicast:239.74.163.2,port={port}"])
+    bus = f"can0=udp_multicast:239.74.163.2,port={port}"
+    return Rig(folder, endpoints, prefix, [bus], starter=starter)
 
 
 @pytest.fixture
@@ -190,25 +192,20 @@ def test_two_hands_on_two_buses_are_served_by_one_daemon(rig: Rig, free_port: in
 
 
 def test_two_daemons_use_separate_endpoints_and_buses(
-    short_path: Path, network: list[str], free_port: int
+    short_path: Path, starter: Starter, network: list[str], free_port: int
 ) -> None:
-    left = named(rig_in(short_path / "left", network, free_port), "left")
-    right = rig_in(short_path / "right", network, free_port + 1)
+    left = named(rig_in(short_path / "left", starter, network, free_port), "left")
+    right = rig_in(short_path / "right", starter, network, free_port + 1)
     try:
         for rig in (left, right):
             rig.simulate()
             rig.start("run")
         for rig, hand in ((left, "left"), (right, "right")):
-            status = rig.wait_operational()
-            assert {pad["hand"] for pad in status["pads"]} == {hand}
-        again = subprocess.run(
-            left.command("run", str(left.config), "--bus", left.bus[0]),
-            capture_output=True,
-            text=True,
-            timeout=START_S,
-        )
-        assert again.returncode == 1
-        assert "another daemon is using it" in again.stderr
+            pads = rig.wait_operational()["pads"]
+            assert {pad["hand"] for pad in pads} == {hand}
+        status, printed = left.call("run", str(left.config), "--bus", left.bus[0])
+        assert status == 1
+        assert "another daemon is using it" in printed
         assert left.end("run") == 0
         ticks = right.status()["service"]["ticks"]
         right.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
@@ -221,8 +218,9 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
     short_path: Path, networks: tuple[list[str], list[list[str]]], free_port: int
 ) -> None:
     middle, prefixes = networks
+    starters = [Starter(prefix) for prefix in prefixes]
     robots = [
-        named(rig_in(short_path / f"r{number}", prefix, free_port), hand)
+        named(rig_in(short_path / f"r{number}", starters[number - 1], prefix, free_port), hand)
         for number, (prefix, hand) in enumerate(zip(prefixes, ("left", "right"), strict=True), 1)
     ]
     listen = [f"tcp/10.88.{number}.1:7447" for number in (1, 2)]
@@ -272,8 +270,9 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
             assert robot.end("bridge") == 0
             assert " 0 lost" in robot.printed("bridge")
     finally:
-        for robot in robots:
+        for robot, starter in zip(robots, starters, strict=True):
             robot.end_all()
+            starter.close()
         if remote is not None:
             remote.close()
 
@@ -306,14 +305,10 @@ def test_control_is_not_forwarded_unless_enabled(rig: Rig, free_port: int) -> No
         (["--endpoint", "a=nonsense", "--connect", "tcp/127.0.0.1:1"], "no ZeroMQ endpoint"),
     ],
 )
-def test_wrong_options_of_a_bridge_are_rejected_with_the_remedy(arguments: list[str], error: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "handtouch", "bridge", "zenoh", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=START_S,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert error in done.stderr
-    assert "Traceback" not in done.stderr
+def test_wrong_options_of_a_bridge_are_rejected_with_the_remedy(
+    rig: Rig, arguments: list[str], error: str
+) -> None:
+    status, printed = rig.call("bridge", "zenoh", *arguments)
+    assert status == 2
+    assert error in printed
+    assert "Traceback" not in printed

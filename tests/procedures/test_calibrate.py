@@ -26,8 +26,9 @@ from handtouch import cli, client, config
 from handtouch.calibration.calibration import CalibrationVersion
 from handtouch.calibration.store import Store
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.pad_model import PadModel, default_calibration_id_of, law_of
+from handtouch.core.pad_model import default_calibration_id_of, law_of
 from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.device import DeviceBus
 from handtouch.host.units import GRAM_FORCE_N
 from handtouch.procedures import calibrate
@@ -486,7 +487,7 @@ def test_a_law_of_a_growing_radius_is_stored_and_applied(
     law = CalibrationVersion.from_json(json.loads(json.dumps(version.to_json()))).calibration.law
     assert law is not None
     assert law.hertz_force_n == pytest.approx(IN_THE_MIDDLE_N)
-    model = PadModel(deployed())
+    model = build_pad_model(deployed())
     before_a = model.end_threshold_a[0]
     model.set_calibration(0, ActiveCalibration(version.calibration_id, law=law))
     light_a = min(reading.current_a for reading in readings)  # of 10 gf, four times the threshold

@@ -474,12 +474,10 @@ def test_node_ids_are_assigned_upwards_in_the_order_of_serial_numbers(wire: Virt
     assert {node.node_id: node.serial for node in report.nodes} == {0x1F: 9, 0x20: 77, 0x21: 2002, 0x22: 3001}
 
 
-@pytest.mark.parametrize("serials", [[3], [101, 102, 70103], [5, 0xFFFFFFFF, 80, 680, 2097152, 9, 0, 10]])
-@pytest.mark.parametrize("compares", [lambda _: False, lambda serial: serial % 2 == 1], ids=["none", "mixed"])
-def test_nodes_that_do_not_compare_lss_requests_all_get_ids_in_one_scan(
-    wire: VirtualBus, serials: list[int], compares: Callable[[int], bool]
-) -> None:
-    _, made = unconfigured(wire, serials, compares)
+def test_nodes_that_do_not_compare_lss_requests_all_get_ids_in_one_scan(wire: VirtualBus) -> None:
+    """As test_lss.py has it of any nodes in simulated time; here the waits are real."""
+    serials = [101, 102, 70104]
+    _, made = unconfigured(wire, serials, lambda serial: serial % 2 == 1)
     (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=1, listen_s=0.05))
     assert not report.problems
     expected = {serial: node_id for node_id, serial in enumerate(sorted(serials), 1)}

@@ -17,6 +17,7 @@ from handtouch.config.files import deployment_files
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.host.build import build_info
 from handtouch.record.foxglove import FoxgloveConverter
 from handtouch.record.mcap_file import RecordingFile
@@ -101,7 +102,7 @@ def deployment() -> Deployment:
 
 @pytest.fixture(scope="session")
 def model(deployment: Deployment) -> PadModel:
-    return PadModel(deployment)
+    return build_pad_model(deployment)
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,9 @@ import pytest
 from handtouch import wire
 from handtouch.config import parse
 from handtouch.core.events import ExcitationEvent
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.sheet_force import ForceReference
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.record.exact_replay import ExactReplay
 from handtouch.record.recording import Recording
 
@@ -23,7 +23,7 @@ from .conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand, Reco
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> RecordingSession:
     deployment = parse(DEPLOYMENT.replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]"))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
 
     def make(take: Callable[[list[bytes]], None]) -> Hand:
         sink = CollectingSink(take)
@@ -78,7 +78,7 @@ def test_reference_forces_and_gravity_are_replayed_from_any_state(session: Recor
 
 def test_a_replay_is_exact_after_excitation_was_switched_off(tmp_path: Path) -> None:
     deployment = parse(DEPLOYMENT.replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]"))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
 
     def make(take: Callable[[list[bytes]], None]) -> Hand:
         sink = CollectingSink(take)

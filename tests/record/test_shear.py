@@ -13,10 +13,10 @@ import pytest
 from handtouch import wire
 from handtouch.config import parse
 from handtouch.core.events import BaselineEvent
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.reload import find_changes
 from handtouch.daemon.sampling import SamplingController
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.daemon.tare import TareJob
 from handtouch.record.exact_replay import ExactReplay
 from handtouch.record.recording import Recording
@@ -53,7 +53,7 @@ class ShearHand(Hand):
 @pytest.fixture(scope="module")
 def make_shear_hand() -> Callable[..., ShearHand]:
     deployment = parse(shear_deployment(KINDS))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
 
     def make(take: Callable[[list[bytes]], None] = lambda _: None) -> ShearHand:
         sink = CollectingSink(take)
@@ -187,6 +187,6 @@ def test_a_reload_keeps_the_rest_position_unless_the_shear_pad_changed(
     deployment = parse(shear_deployment(KINDS).replace(*change))
     changes, _ = find_changes(hand.deployment, deployment)
     assert changes == {0: changed_keys}
-    hand.pipeline.replace_model(PadModel(deployment), [*changes])
+    hand.pipeline.replace_model(build_pad_model(deployment), [*changes])
     hand.press(0.0, (0.05e-3, 0.0))
     assert np.isfinite(hand.pipeline.state.shear_rest_m[0, 0]) == is_kept

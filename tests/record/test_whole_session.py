@@ -20,13 +20,13 @@ from handtouch.config import Deployment, parse
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import SceneRequest
 from handtouch.core.events import SamplingEvent
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import ActiveScenes, Demand
 from handtouch.core.sheet_force import ForceReference
 from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.supervisor_client import SupervisorClient
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.daemon.tare import TareJob
 from handtouch.host.build import build_info
 from handtouch.record.exact_replay import ExactReplay
@@ -118,7 +118,7 @@ class Session:
     def _make_hand(self, take: Callable[[list[bytes]], None]) -> Hand:
         sink = CollectingSink(take)
         sink.subscriptions = frozenset({b"contact/"})  # type: ignore[attr-defined]
-        pipeline = Pipeline(PadModel(self.deployment), PERIOD_NS, 0.6, sink, SESSION)
+        pipeline = Pipeline(build_pad_model(self.deployment), PERIOD_NS, 0.6, sink, SESSION)
         return Hand(self.deployment, pipeline, sink)
 
     def swap(self, pad: int, before: int | None, after: int) -> None:
@@ -148,7 +148,7 @@ class Session:
         self.demand.update(self.hand.t_ns)
 
     def reload(self, deployment: Deployment) -> None:
-        self.pipeline.replace_model(PadModel(deployment), [0, 1])
+        self.pipeline.replace_model(build_pad_model(deployment), [0, 1])
         self.pipeline.journal.publish_config(
             deployment, deployment_files(deployment), build_info(), self.hand.t_ns
         )

@@ -11,8 +11,8 @@ import pytest
 
 from handtouch import config, wire
 from handtouch.config import shipped
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate import TactileReading, TactileSensor
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.tactile.live_sheet import LiveSheets
@@ -101,7 +101,7 @@ def test_readings_are_the_hand_frames_of_the_daemons_pipeline_for_the_same_count
     readings = run.readings(50)
     sink = Sink()
     period_ns = round(run.sensor.period_s * 1e9)
-    pipeline = Pipeline(PadModel(HAND), period_ns, HAND.daemon.sample_window_fraction, sink)
+    pipeline = Pipeline(build_pad_model(HAND), period_ns, HAND.daemon.sample_window_fraction, sink)
     pipeline.node_state[:] = PadState.CLEAR
     for reading in readings:
         t_ns = int(reading.sample_ns[0])
