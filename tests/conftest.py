@@ -17,6 +17,7 @@ import pytest
 import zmq
 from hypothesis import HealthCheck, settings
 
+from tests.durations import Durations
 from tests.starter import Starter, find_port, own_endpoints
 
 # how long an example takes says nothing on shared cores; CI tries the same ones every time
@@ -39,10 +40,25 @@ COMPILED_AGAIN = "tables"
 BUILDS_WHEEL = "test_packaging.py"
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add `--within`, by which `make check` chooses."""
+    parser.addoption("--within", type=float, metavar="S", help="run the fastest tests that take S seconds")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep durations between sessions."""
+    config.pluginmanager.register(Durations(ROOT / "build/tests/durations.json"), "durations")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The file that builds the wheel first, which others wait for, then long ones, so that workers end
     together. Without SocketCAN skip its tests; in vcan-run it is."""
-    items.sort(key=lambda item: (item.path.name != BUILDS_WHEEL, "end_to_end" not in item.path.parts))
+    durations: Any = config.pluginmanager.get_plugin("durations")
+    if config.option.within is not None:
+        items[:] = durations.fastest(items, config.option.within)
+    durations.sort(items)
+    items.sort(key=lambda item: item.path.name != BUILDS_WHEEL)
     if "VCAN_RUN" in os.environ or Path("/sys/class/net/vcan0").exists():
         return
     skip = pytest.mark.skip(reason="no vcan0 here; `make socketcan` runs these tests where there is one")

@@ -1,0 +1,72 @@
+"""How long tests took in earlier sessions: the longest files begin first, `--within` takes the fastest tests.
+
+Public name: `Durations`, a plugin of pytest.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+
+class Durations:
+    """Durations [s] of tests' set-up and of the rest, in a file that each session brings up to date.
+
+    A set-up may serve its whole file: each test counts all of those, a choice of tests counts them once.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._known = self._read()
+        self._measured: dict[str, list[float]] = {}
+
+    def sort(self, items: list[pytest.Item]) -> None:
+        """Sort by files, longest first; before these what was never measured, whole processes first."""
+        length_s = Counter[str]()
+        for item in items:
+            length_s[file_of(item.nodeid)] += sum(self._known.get(item.nodeid, ()))
+
+        def order(item: pytest.Item) -> tuple[bool, float]:
+            file = file_of(item.nodeid)
+            return length_s[file] > 0, -length_s[file] or "end_to_end" not in file
+
+        items.sort(key=order)
+
+    def fastest(self, items: list[pytest.Item], seconds: float) -> list[pytest.Item]:
+        """Return the fastest tests that take so long together, of those ever measured."""
+        known = {item.nodeid: self._known[item.nodeid] for item in items if item.nodeid in self._known}
+        setup_s = Counter[str]()
+        for test, (own_s, _) in known.items():
+            setup_s[file_of(test)] += own_s
+        left_s, files, taken = seconds, set[str](), set[str]()
+        for test in sorted(known, key=lambda test: known[test][1] + setup_s[file_of(test)]):
+            left_s -= known[test][1] + (0.0 if file_of(test) in files else setup_s[file_of(test)])
+            if left_s < 0:
+                break
+            files.add(file_of(test))
+            taken.add(test)
+        return [item for item in items if item.nodeid in taken]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Add up a test's phases; one that is skipped tells nothing."""
+        if not report.skipped:
+            self._measured.setdefault(report.nodeid, [0.0, 0.0])[report.when != "setup"] += report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Write, but for xdist's workers, whose reports all reach their controller."""
+        if self._measured and "PYTEST_XDIST_WORKER" not in os.environ:
+            rounded = {test: [round(part_s, 3) for part_s in both] for test, both in self._measured.items()}
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.write_text(json.dumps(self._read() | rounded, indent=0))
+
+    def _read(self) -> dict[str, list[float]]:
+        return dict(json.loads(self._path.read_text())) if self._path.exists() else {}
+
+
+def file_of(test: str) -> str:
+    """Return the file in a test's id."""
+    return test.partition("::")[0]
