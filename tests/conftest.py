@@ -36,7 +36,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
 # tables of pads are named by the hash of their parameters and code: all workers and sessions share them
 os.environ["XDG_CACHE_HOME"] = str(ROOT / "build/tests")
-COMPILED_AGAIN = "tables"
 BUILDS_WHEEL = "test_packaging.py"
 
 
@@ -203,17 +202,13 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[
 
 
 def copy_compiled(source: Path) -> None:
-    """Save a source tree half a minute of the compiler: the stages compiled here, but one that it compiles.
+    """Copy the compiled stages into a source tree, but the smallest, which it compiles: saves half a minute.
 
-    Their names carry the hash of their sources, so that others are none.
+    Their names carry the hash of their sources; of other sources they don't count.
     """
     here = ROOT / "src/handtouch/core/stages/_compiled"
     if here.exists():
-        shutil.copytree(
-            here,
-            source / here.relative_to(ROOT),
-            ignore=shutil.ignore_patterns("tolerances-*", "__pycache__"),
-        )
+        shutil.copytree(here, source / here.relative_to(ROOT), ignore=shutil.ignore_patterns("tables-*"))
 
 
 @pytest.fixture(scope="session")
