@@ -138,8 +138,8 @@ def starter(network: list[str]) -> Iterator[Starter]:
 
 
 @pytest.fixture(scope="session")
-def vcan_starter() -> Iterator[Starter]:
-    """Starts processes where SocketCAN is."""
+def host_starter() -> Iterator[Starter]:
+    """Starts processes in the network of the tests themselves, where SocketCAN is."""
     made = Starter([])
     yield made
     made.close()

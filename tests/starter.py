@@ -104,10 +104,10 @@ class Starter:
                 pass_fds=[theirs.fileno()],
             )
 
-    def start(self, arguments: list[str], output: IO[str]) -> Started:
-        """`handtouch ARGUMENTS`, printing to a file."""
+    def start(self, arguments: list[str], output: IO[str], **environment: str) -> Started:
+        """`handtouch ARGUMENTS`, printing to a file; `environment` adds to this process's."""
         ours, theirs = os.pipe()
-        request = json.dumps([arguments, os.getcwd(), dict(os.environ)]).encode()
+        request = json.dumps([arguments, os.getcwd(), {**os.environ, **environment}]).encode()
         socket.send_fds(self._socket, [request], [output.fileno(), theirs])
         os.close(theirs)
         pid = self._socket.recv(16)

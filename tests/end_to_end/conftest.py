@@ -127,11 +127,11 @@ class Rig:
         self.processes[name] = process
         return process
 
-    def call(self, *arguments: str) -> tuple[int, str]:
+    def call(self, *arguments: str, **environment: str) -> tuple[int, str]:
         """Exit status and output of a handtouch command."""
         assert self._starter is not None
         with (self.folder / "call.txt").open("w+") as output:
-            status = self._starter.start([*arguments], output).wait(START_S)
+            status = self._starter.start([*arguments], output, **environment).wait(START_S)
             output.seek(0)
             return status, output.read()
 
@@ -290,9 +290,9 @@ def working(tmp_path_factory: pytest.TempPathFactory, network: list[str], starte
 
 
 @pytest.fixture
-def vcan_rig(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> Iterator[Rig]:
+def vcan_rig(tmp_path: Path, endpoints: dict[str, str], host_starter: Starter) -> Iterator[Rig]:
     """A deployment on SocketCAN; only inside vcan-run."""
-    made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"], starter=vcan_starter)
+    made = Rig(tmp_path, endpoints, [], ["can0=socketcan:vcan0"], starter=host_starter)
     # all processes share the guest's one processor
     text = made.config.read_text()
     made.config.write_text(text.replace(f"sync_period_ms = {PERIOD_MS}", "sync_period_ms = 50.0"))

@@ -275,10 +275,9 @@ def test_commissioning_is_refused_while_a_daemon_runs(rig: Any) -> None:
     rig.config.write_text(first_pads(rig.config.read_text(), 1))
     rig.start("run")
     rig.status()
-    command = rig.command("commission", str(rig.config), "--bus", rig.bus[0])
-    done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
-    assert done.returncode == 1
-    assert "a daemon is running at" in done.stderr
+    status, printed = rig.call("commission", str(rig.config), "--bus", rig.bus[0])
+    assert status == 1
+    assert "a daemon is running at" in printed
 
 
 if __name__ == "__main__":

@@ -176,6 +176,9 @@ def test_disconnected_node_is_stale_then_lost_and_recovers_without_restart(rig: 
                 reason = message.reason
         assert states[-2:] == ["stale", "lost"]
         assert "heartbeat" in reason
+    rig.wait("lost", lambda status: _row(status, "palm_heel")["state"] == "lost")
+    exit_status, printed = rig.call("status", "--endpoint", rig.endpoints["control"])
+    assert (exit_status, "heartbeat" in printed) == (1, True), printed
     rig.simulate()
     rig.wait_operational()
     _contacts(rig, _ends(1))
@@ -188,10 +191,7 @@ def test_missing_nodes_are_reported_and_the_other_nodes_work(rig: Any) -> None:
     upto = text.index("[[hand.pad]]", cut + 10)
     others.write_text(text[:cut] + text[upto:])
     buses = [argument for bus in rig.bus for argument in ("--bus", bus)]
-    rig.processes["simulate"] = subprocess.Popen(
-        rig.command("simulate", str(others), "--scenario", str(rig.scenario), *buses),
-        stdout=subprocess.DEVNULL,
-    )
+    rig.start_command("simulate", str(others), "--scenario", str(rig.scenario), *buses)
     rig.start("run")
     status = rig.wait_operational(14)
     missing = _row(status, "thumb_middle")
@@ -208,9 +208,8 @@ def test_stalled_or_killed_subscriber_affects_no_other(working: Any) -> None:
     stalled.setsockopt(zmq.RCVBUF, 1024)
     stalled.subscribe("")
     stalled.connect(working.endpoints["live"])
-    dying = subprocess.Popen(
-        working.command("watch", "--json", "--endpoint", working.endpoints["live"], "contact/*/*", "hand/*"),
-        stdout=subprocess.DEVNULL,
+    dying = working.start_command(
+        "watch", "--json", "--endpoint", working.endpoints["live"], "contact/*/*", "hand/*"
     )
     contacts = _contacts(working, _ends(1))
     dying.kill()
@@ -265,28 +264,18 @@ def test_after_sigkill_a_restart_finds_the_nodes_running_and_does_not_reset_them
 
 def test_config_error_exits_with_status_2_before_the_bus_is_opened(rig: Any) -> None:
     rig.config.write_text(rig.config.read_text().replace("gap_mm = 0.8", "gap_mm = 80.0", 1))
-    done = subprocess.run(
-        rig.command("run", str(rig.config), "--bus", "can0=no_such_interface:can9"),
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_S,
-    )
-    assert done.returncode == 2
-    assert "hand.toml" in done.stderr
-    assert "gap_mm = 80" in done.stderr
-    assert "Traceback" not in done.stderr
+    status, printed = rig.call("run", str(rig.config), "--bus", "can0=no_such_interface:can9")
+    assert status == 2
+    assert "hand.toml" in printed
+    assert "gap_mm = 80" in printed
+    assert "Traceback" not in printed
 
 
 def test_missing_bus_exits_with_status_1_and_a_remedy(rig: Any) -> None:
-    done = subprocess.run(
-        rig.command("run", str(rig.config), "--bus", "can0=socketcan:can77"),
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_S,
-    )
-    assert done.returncode == 1
-    assert "can77" in done.stderr
-    assert "Traceback" not in done.stderr
+    status, printed = rig.call("run", str(rig.config), "--bus", "can0=socketcan:can77")
+    assert status == 1
+    assert "can77" in printed
+    assert "Traceback" not in printed
 
 
 @pytest.mark.parametrize("request_bytes", [b"", b"\xc1", b"\x80", b"\x93\x01\x02\x03"])
@@ -305,22 +294,14 @@ def test_malformed_request_gets_an_error_and_ticks_continue(working: Any, reques
     working.wait("ticking on", lambda status: status["service"]["ticks"] > ticks)
 
 
-def test_status_prints_text_and_json(rig: Any) -> None:
-    rig.simulate()
-    rig.start("run")
-    rig.wait_operational()
-    command = rig.command("status", "--endpoint", rig.endpoints["control"])
+def test_status_prints_text_and_json(working: Any) -> None:
+    command = ("status", "--endpoint", working.endpoints["control"])
     end_s = time.monotonic() + LONGEST_S
-    options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": LONGEST_S}
-    while (done := subprocess.run(command, **options)).returncode != 0:
-        assert time.monotonic() < end_s, done.stdout  # a pause of the machine makes a pad stale for a moment
-    assert re.search(r"bus can0: \w+, load", done.stdout)
-    assert "right/thumb_distal" in done.stdout
-    assert done.stdout.count("operational") == 15
-    answer = json.loads(subprocess.run([*command, "--json"], capture_output=True, timeout=LONGEST_S).stdout)
+    while (answered := working.call(*command))[0] != 0:
+        assert time.monotonic() < end_s, answered  # a pause of the machine makes a pad stale for a moment
+    printed = answered[1]
+    assert re.search(r"bus can0: \w+, load", printed)
+    assert "right/thumb_distal" in printed
+    assert printed.count("operational") == 15
+    answer = json.loads(working.call(*command, "--json")[1])
     assert {pad["state"] for pad in answer["pads"]} <= {"clear", "touched", "stale"}  # paused
-    rig.end("simulate")
-    rig.wait("lost", lambda status: _row(status, "palm_heel")["state"] == "lost")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S)
-    assert done.returncode == 1
-    assert "heartbeat" in done.stdout

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import socket
-import subprocess
 import tarfile
 import tomllib
 from collections.abc import Iterator
@@ -20,6 +18,7 @@ import pytest
 from handtouch.cli import main
 from handtouch.client import connect, keys, request
 from handtouch.record.recording import Recording
+from tests.starter import Starter
 
 from .conftest import START_S, Rig
 
@@ -45,13 +44,12 @@ def _free_ports(count: int) -> list[int]:
 class Reachable(Rig):
     """A daemon on all interfaces, without nodes; it ticks nevertheless."""
 
-    def __init__(self, folder: Path, with_keys: bool) -> None:
+    def __init__(self, folder: Path, starter: Starter, with_keys: bool) -> None:
         streams = ("live", "complete", "control", "inputs")
         self.ports = dict(zip(streams, _free_ports(len(streams)), strict=True))
         settings = {stream: f"tcp://0.0.0.0:{port}" for stream, port in self.ports.items()}
-        super().__init__(
-            folder, settings | ({"keys": "keys"} if with_keys else {}), [], ["can0=virtual:empty"]
-        )
+        settings |= {"keys": "keys"} if with_keys else {}
+        super().__init__(folder, settings, [], ["can0=virtual:empty"], starter=starter)
         self.keys = folder / "keys"
 
     def at(self, stream: str) -> str:
@@ -60,55 +58,45 @@ class Reachable(Rig):
     def key(self, name: str) -> Path:
         return self.folder / f"{name}.key"
 
-    def run_command(self, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            self.command(*arguments),
-            capture_output=True,
-            text=True,
-            timeout=START_S,
-            check=False,
-            env={**os.environ, **environment},
-        )
-
     def ask(self, name: str) -> dict[str, Any]:
         return request("status", endpoint=self.at("control"), key=self.key(name), timeout_s=START_S)
 
 
 @pytest.fixture
-def reachable(tmp_path: Path) -> Iterator[Reachable]:
-    made = Reachable(tmp_path, with_keys=True)
-    assert made.run_command("keys", "make", str(made.keys), "--name", "robot1").returncode == 0
+def reachable(tmp_path: Path, host_starter: Starter) -> Iterator[Reachable]:
+    made = Reachable(tmp_path, host_starter, with_keys=True)
+    assert made.call("keys", "make", str(made.keys), "--name", "robot1")[0] == 0
     for name, rights in (("reader", "read"), ("pilot", "control")):
-        done = made.run_command(
+        status, printed = made.call(
             *("keys", "client", str(made.keys), name, "--rights", rights, "--out", str(made.key(name)))
         )
-        assert done.returncode == 0, done.stderr
+        assert status == 0, printed
     yield made
     made.end_all()
 
 
-def test_daemon_without_keys_refuses_public_endpoints(tmp_path: Path) -> None:
-    rig = Reachable(tmp_path, with_keys=False)
-    done = rig.run_command("run", str(rig.config))
-    assert done.returncode == 2
-    assert "is reachable from other machines" in done.stderr
-    assert "handtouch keys make" in done.stderr
+def test_daemon_without_keys_refuses_public_endpoints(tmp_path: Path, host_starter: Starter) -> None:
+    rig = Reachable(tmp_path, host_starter, with_keys=False)
+    status, printed = rig.call("run", str(rig.config))
+    assert status == 2
+    assert "is reachable from other machines" in printed
+    assert "handtouch keys make" in printed
 
 
-def test_missing_key_folder_is_refused(tmp_path: Path) -> None:
-    rig = Reachable(tmp_path, with_keys=True)
-    done = rig.run_command("run", str(rig.config))
-    assert done.returncode == 2
-    assert f"handtouch keys make {rig.keys}" in done.stderr
+def test_missing_key_folder_is_refused(tmp_path: Path, host_starter: Starter) -> None:
+    rig = Reachable(tmp_path, host_starter, with_keys=True)
+    status, printed = rig.call("run", str(rig.config))
+    assert status == 2
+    assert f"handtouch keys make {rig.keys}" in printed
 
 
 def test_readable_secret_is_refused(reachable: Reachable) -> None:
     (reachable.keys / "server.key").chmod(0o644)
-    done = reachable.run_command("run", str(reachable.config), "--bus", reachable.bus[0])
-    assert done.returncode == 2
-    assert f"chmod 600 {reachable.keys / 'server.key'}" in done.stderr
-    found = reachable.run_command("doctor", str(reachable.config))
-    assert f"chmod 600 {reachable.keys / 'server.key'}" in found.stdout
+    status, printed = reachable.call("run", str(reachable.config), "--bus", reachable.bus[0])
+    assert status == 2
+    assert f"chmod 600 {reachable.keys / 'server.key'}" in printed
+    _, printed = reachable.call("doctor", str(reachable.config))
+    assert f"chmod 600 {reachable.keys / 'server.key'}" in printed
 
 
 def test_each_key_grants_its_right(reachable: Reachable, tmp_path: Path) -> None:
@@ -142,20 +130,20 @@ def test_commands_take_a_key_by_option_and_by_environment(reachable: Reachable) 
     reachable.ask("pilot")
     control, live = ("--endpoint", reachable.at("control")), ("--endpoint", reachable.at("live"))
     pilot, reader = str(reachable.key("pilot")), str(reachable.key("reader"))
-    done = reachable.run_command("status", *control, "--key", pilot, "--json")
-    assert '"pads"' in done.stdout, done.stderr
-    done = reachable.run_command("status", *control, "--json", HANDTOUCH_KEY=pilot)
-    assert '"pads"' in done.stdout, done.stderr
-    done = reachable.run_command("status", *control, "--json", HANDTOUCH_KEY=reader)
-    assert '"pads"' in done.stdout, done.stderr
-    done = reachable.run_command("tare", *control, HANDTOUCH_KEY=reader)
-    assert done.returncode == 1
-    assert 'needs "control"' in done.stderr
-    done = reachable.run_command("watch", "service", *live, "--key", reader, "--seconds", "3")
-    assert done.returncode == 0, done.stderr
-    done = reachable.run_command("watch", "service", *live, "--seconds", "60")
-    assert done.returncode == 1
-    assert "--key" in done.stderr
+    status, printed = reachable.call("status", *control, "--key", pilot, "--json")
+    assert '"pads"' in printed, printed
+    status, printed = reachable.call("status", *control, "--json", HANDTOUCH_KEY=pilot)
+    assert '"pads"' in printed, printed
+    status, printed = reachable.call("status", *control, "--json", HANDTOUCH_KEY=reader)
+    assert '"pads"' in printed, printed
+    status, printed = reachable.call("tare", *control, HANDTOUCH_KEY=reader)
+    assert status == 1
+    assert 'needs "control"' in printed
+    status, printed = reachable.call("watch", "service", *live, "--key", reader, "--seconds", "3")
+    assert status == 0, printed
+    status, printed = reachable.call("watch", "service", *live, "--seconds", "60")
+    assert status == 1
+    assert "--key" in printed
 
 
 def test_garbage_on_raw_sockets_does_not_stop_ticks(reachable: Reachable) -> None:
@@ -204,11 +192,11 @@ def test_a_support_archive_has_status_and_recording_and_no_secret(reachable: Rea
     while "recording.mcap" not in contents:  # a slow machine may receive nothing in time
         archive = reachable.folder / "report.tar.gz"
         archive.unlink(missing_ok=True)
-        done = reachable.run_command(
+        status, printed = reachable.call(
             *("support", str(reachable.config), "--key", str(reachable.key("pilot")), "--seconds", "1"),
             *("--log", str(log), "-o", str(archive)),
         )
-        assert done.returncode in (0, 1), done.stderr
+        assert status in (0, 1), printed
         assert archive.stat().st_mode & 0o777 == 0o600
         with tarfile.open(archive) as opened:
             contents = {

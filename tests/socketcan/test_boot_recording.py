@@ -49,7 +49,7 @@ def device(tmp_path: Path) -> Iterator[Device]:
 
 
 @pytest.fixture
-def daemon(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> Iterator[None]:
+def daemon(tmp_path: Path, endpoints: dict[str, str], host_starter: Starter) -> Iterator[None]:
     settings = "".join(f'{stream} = "{endpoint}"\n' for stream, endpoint in endpoints.items())
     text = shipped.path("two_finger.toml").read_text()
     text = text.replace("[daemon]\n", f"[daemon]\nsupervise = false\n{settings}")
@@ -59,7 +59,7 @@ def daemon(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> 
     shutil.copy(shipped.path("two_finger.urdf"), tmp_path)
     with (tmp_path / "printed.txt").open("w") as output:
         arguments = ["run", str(tmp_path / "hand.toml"), "--bus", "can0=socketcan:vcan0"]
-        process = vcan_starter.start(arguments, output)
+        process = host_starter.start(arguments, output)
     yield
     process.terminate()
     process.wait(LONGEST_S)

@@ -84,8 +84,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, endpoints: dict[str, str], vcan_starter: Starter) -> Iterator[Bench]:
-    made = Bench(tmp_path, endpoints, vcan_starter)
+def bench(tmp_path: Path, endpoints: dict[str, str], host_starter: Starter) -> Iterator[Bench]:
+    made = Bench(tmp_path, endpoints, host_starter)
     yield made
     made.close()
 

