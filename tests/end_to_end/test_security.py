@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 import signal
 import socket
 import tarfile
@@ -62,15 +63,25 @@ class Reachable(Rig):
         return request("status", endpoint=self.at("control"), key=self.key(name), timeout_s=START_S)
 
 
-@pytest.fixture
-def reachable(tmp_path: Path, host_starter: Starter) -> Iterator[Reachable]:
-    made = Reachable(tmp_path, host_starter, with_keys=True)
+@pytest.fixture(scope="module")
+def made_keys(tmp_path_factory: pytest.TempPathFactory, host_starter: Starter) -> Path:
+    """Folder with the keys of a robot and of two clients, as the commands make them."""
+    made = Reachable(tmp_path_factory.mktemp("keys"), host_starter, with_keys=True)
     assert made.call("keys", "make", str(made.keys), "--name", "robot1")[0] == 0
     for name, rights in (("reader", "read"), ("pilot", "control")):
         status, printed = made.call(
             *("keys", "client", str(made.keys), name, "--rights", rights, "--out", str(made.key(name)))
         )
         assert status == 0, printed
+    return made.folder
+
+
+@pytest.fixture
+def reachable(tmp_path: Path, host_starter: Starter, made_keys: Path) -> Iterator[Reachable]:
+    made = Reachable(tmp_path, host_starter, with_keys=True)
+    shutil.copytree(made_keys / "keys", made.keys)
+    for file in made_keys.glob("*.key"):
+        shutil.copy(file, tmp_path)
     yield made
     made.end_all()
 

@@ -142,15 +142,19 @@ def test_hidden_law_is_found_without_scatter() -> None:
 
 @pytest.mark.parametrize("radius_std", [0.0, 0.1])
 def test_intervals_cover_the_true_law_in_95_percent_of_procedures(radius_std: float) -> None:
-    sessions = 100
-    held = dict.fromkeys(PARAMETERS, 0)
+    """Their half widths are 1.96 standard deviations of the errors' logarithms, give or take 2.5 of 40."""
+    sessions = 40
+    errors = np.zeros((sessions, len(PARAMETERS)))
     for seed in range(sessions):
         fit = fitted(Table(weights(), seed, radius_std).readings(), max(radius_std, 0.002))
         assert not fit.problems
-        for name in PARAMETERS:
-            held[name] += fit.intervals[name].low <= TRUE[name] <= fit.intervals[name].high
-    for name, count in held.items():
-        assert 0.90 <= count / sessions <= 0.995, (name, count)  # 95 %, give or take 2.5 deviations of 100
+        for number, name in enumerate(PARAMETERS):
+            interval = fit.intervals[name]
+            half_width = math.log(interval.high / interval.low) / 2
+            errors[seed, number] = 1.96 * math.log(getattr(fit.law, name) / TRUE[name]) / half_width
+    assert (np.mean(np.abs(errors) <= 1.96, axis=0) >= 0.86).all(), errors
+    deviations = np.sqrt(np.mean(errors**2, axis=0))
+    assert (np.abs(deviations - 1) <= 2.5 / math.sqrt(2 * sessions)).all(), deviations
 
 
 WIDE_SPAN = "10,20,50,100,200,500,1000,2000"
