@@ -74,12 +74,13 @@ examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gr
 
 .PHONY: test check others lint types unit fastest coverage socketcan docs tables wiring
 test: ## run everything that CI runs
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target socketcan others
+	@mkdir -p build; log=build/socketcan.txt; : >$$log; \
+	$(MAKE) --no-print-directory --jobs=2 TO=">$$log 2>&1" socketcan others; status=$$?; cat $$log; exit $$status
 
-check: ## run lint, types and the fastest tests, as far as `make test` measured them; 90 seconds
+check: ## run lint, types and the fastest tests, as far as `make test` measured them
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types fastest
 
-# the tests on SocketCAN, timed by one processor, go first
+# beside the tests on SocketCAN, which need a processor in time
 others: $(VENV)/.dev $(VENV)/.core
 	@nice -n 5 $(MAKE) --no-print-directory lint types docs unit
 
@@ -106,14 +107,14 @@ wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
-	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@$(MAKE) --no-print-directory unit ARGS="--cov --cov-report=term:skip-covered $(ARGS)"
 
 socketcan: $(VENV)/.dev $(VENV)/.core ## run the tests on SocketCAN; skipped without it, which fails CI
 	@marked=$$(grep -rl --include='*.py' 'mark\.socketcan' tests); \
-	VCAN_RUN_TIMEOUT=900 tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS); status=$$?; \
+	VCAN_RUN_TIMEOUT=900 tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS) $(TO); status=$$?; \
 	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
 	elif [ $$status -eq 77 ]; then echo "SocketCAN tests were skipped, and CI needs them"; exit 1; fi; exit $$status
 
