@@ -84,6 +84,7 @@ check: ## run lint, types and the fastest tests, as far as `make test` measured 
 others: $(VENV)/.dev $(VENV)/.core
 	@nice -n 5 $(MAKE) --no-print-directory lint types docs unit
 
+# for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
 	@$(MAKE) --no-print-directory unit ARGS="--within 80 $(ARGS)"
 

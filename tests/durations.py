@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+UNKNOWN_S, UNKNOWN_PROCESSES_S = 0.1, 10.0
+"""What a test that was never measured may take, and one of end_to_end/ or of installations."""
+
 
 class Durations:
     """Durations [s] of tests' set-up and of the rest, in a file that each session brings up to date.
@@ -25,20 +28,15 @@ class Durations:
         self._measured: dict[str, list[float]] = {}
 
     def sort(self, items: list[pytest.Item]) -> None:
-        """Sort by files, longest first; before these what was never measured, whole processes first."""
+        """Sort by files, longest first."""
         length_s = Counter[str]()
         for item in items:
-            length_s[file_of(item.nodeid)] += sum(self._known.get(item.nodeid, ()))
-
-        def order(item: pytest.Item) -> tuple[bool, float]:
-            file = file_of(item.nodeid)
-            return length_s[file] > 0, -length_s[file] or "end_to_end" not in file
-
-        items.sort(key=order)
+            length_s[file_of(item.nodeid)] += sum(self._expected(item.nodeid))
+        items.sort(key=lambda item: -length_s[file_of(item.nodeid)])
 
     def fastest(self, items: list[pytest.Item], seconds: float) -> list[pytest.Item]:
-        """Return the fastest tests that take so long together, of those ever measured."""
-        known = {item.nodeid: self._known[item.nodeid] for item in items if item.nodeid in self._known}
+        """Return the fastest tests that take so long together."""
+        known = {item.nodeid: self._expected(item.nodeid) for item in items}
         setup_s = Counter[str]()
         for test, (own_s, _) in known.items():
             setup_s[file_of(test)] += own_s
@@ -62,6 +60,10 @@ class Durations:
             rounded = {test: [round(part_s, 3) for part_s in both] for test, both in self._measured.items()}
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.write_text(json.dumps(self._read() | rounded, indent=0))
+
+    def _expected(self, test: str) -> list[float]:
+        processes = "end_to_end" in test or test.count("/") == 1
+        return self._known.get(test) or [0.0, UNKNOWN_PROCESSES_S if processes else UNKNOWN_S]
 
     def _read(self) -> dict[str, list[float]]:
         return dict(json.loads(self._path.read_text())) if self._path.exists() else {}
