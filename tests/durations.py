@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,7 @@ class Durations:
 
     def sort(self, items: list[pytest.Item]) -> None:
         """Sort by files, longest first."""
-        length_s = Counter[str]()
+        length_s = defaultdict[str, float](float)
         for item in items:
             length_s[file_of(item.nodeid)] += sum(self._expected(item.nodeid))
         items.sort(key=lambda item: -length_s[file_of(item.nodeid)])
@@ -37,7 +37,7 @@ class Durations:
     def fastest(self, items: list[pytest.Item], seconds: float) -> list[pytest.Item]:
         """Return the fastest tests that take so long together."""
         known = {item.nodeid: self._expected(item.nodeid) for item in items}
-        setup_s = Counter[str]()
+        setup_s = defaultdict[str, float](float)
         for test, (own_s, _) in known.items():
             setup_s[file_of(test)] += own_s
         left_s, files, taken = seconds, set[str](), set[str]()
