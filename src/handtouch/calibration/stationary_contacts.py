@@ -18,7 +18,7 @@ _MAX_FRACTION_CHANGE = 0.012
 """Limit of motion, in fractions, at rest. The error of the mean is of second order, below 1e-4."""
 _MIN_FRACTION_DISTANCE = 0.03
 """Least distance, in fractions, from the previous stationary contact."""
-_NOISE_SIGMAS = 4.0
+_NOISE_SIGMAS = 4.0  # a contact is stationary while its shares stay within
 _SKIPPED_SAMPLES = 2  # at the begin, while the contact grows
 _MAX_SAMPLES = 256
 

@@ -19,10 +19,10 @@ _MIN_SIZE_MM = 0.5
 """least size of a sensing surface"""
 _MIN_OFFSET_MM = 0.05
 """least offset of a mount: a quarter of the error of printed parts, so that nobody states a smaller one"""
-_MIN_GAP_MM = 0.02
-_MIN_RADIUS_MM = 0.05
-_MIN_STD_MM = 0.001
-_MIN_GROUP_MM = 1.0
+_MIN_GAP_MM = 0.02  # narrower gaps can't be cut
+_MIN_RADIUS_MM = 0.05  # smaller contacts than any fingertip makes
+_MIN_STD_MM = 0.001  # a micrometre is better than parts are known
+_MIN_GROUP_MM = 1.0  # pads are farther apart
 _MAX_ANGLE_ERROR_RAD = 1e-3
 _MM_PER_M = 1e3
 

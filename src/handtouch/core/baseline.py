@@ -29,7 +29,7 @@ IntArray = npt.NDArray[np.intp]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md measures what they yield.
 BLOCK_DURATION_NS = 97_000_000  # no multiple of a period: rounding of stamps moves no sample to another block
-_MAX_PAUSE_NS = 3600 * 10**9
+_MAX_PAUSE_NS = 3600 * 10**9  # longer: another clock
 _TRACKING_TIME_S = 10.0  # time constant of offsets
 _NOISE_TIME_S = 60.0  # time constant of the noise estimate
 _NOISE_PERIOD_BLOCKS = 10  # blocks per update of the noise estimate
@@ -38,7 +38,7 @@ _DRIFT_SPEED_PERIOD_S = 60.0  # untouched time per measurement of the drift spee
 _DRIFT_SPEED_GAIN = 0.2  # gain of such a measurement
 _INITIAL_DRIFT_SIGMA_PER_S = 0.02  # initial drift over the noise
 _MAX_RETURN_FRACTION = 0.5  # distance of a released pad from its baseline over the end threshold
-_CONFIDENCE_SIGMA = 3.0
+_CONFIDENCE_SIGMA = 3.0  # deviations of an untouched pad up to a threshold
 _MIN_COMMON_DRIFT_PADS = 3  # untouched pads of a hand
 _GRAVITY_GAIN, _MIN_TURN_SQUARED = 0.02, 0.05  # fraction of an innovation; squared change of unit gravity
 

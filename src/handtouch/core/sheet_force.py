@@ -36,9 +36,9 @@ _MAX_FORCE_STD_FRACTION = 1.0  # deviation over the force: above it, the force i
 _GAIN_STD, _UNKNOWN_GAIN_STD = 0.04, 0.15
 """Relative errors of measured sheets, contact_ohm_std / alpha, and of one that wasn't: its loops, too."""
 _HOUR_S = 3600.0
-_LOG_GAIN_STD_PER_HOUR = 0.05
-_MAX_LOG_GAIN_RATE_PER_S = 0.02
-_OUTLIER_SIGMA = 4.0
+_LOG_GAIN_STD_PER_HOUR = 0.05  # random walk of a pad's gain
+_MAX_LOG_GAIN_RATE_PER_S = 0.02  # so that no reference makes forces jump
+_OUTLIER_SIGMA = 4.0  # references farther off don't count
 _MAX_REFERENCE_OFFSET_NS = 50_000_000  # between a reference and the sample it is compared with
 _MIN_CONTACT_AGE_S = 1.0  # age of a contact that is compared with a reference
 _OF_PAD = (

@@ -21,8 +21,8 @@ from handtouch.hand import pad_network, pad_surface
 from handtouch.hand.robot_models import check_urdfs, unchecked_items
 from handtouch.host.units import GRAM_FORCE_N
 
-MAX_USUAL_LOAD = 0.7
-MAX_USUAL_ASPECT = 3.0
+MAX_USUAL_LOAD = 0.7  # share of the bit rate that leaves reserve for retransmissions
+MAX_USUAL_ASPECT = 3.0  # beyond it errors along the short side grow (docs/theory.md)
 MAX_USUAL_THRESHOLD_N = 1.0
 """Largest usual threshold: fingers grasp with a few newtons; the shipped hands have 0.06 N"""
 MIN_USUAL_SHEET_OHM = 20.0

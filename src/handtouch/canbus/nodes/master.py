@@ -73,7 +73,7 @@ HEARTBEAT_WINDOW_PERIODS = 10
 """Heartbeat periods over which the heartbeat rate is measured."""
 MIN_DOUBLED_WINDOWS = 2
 """Consecutive windows with a doubled rate that show a duplicate id; delayed heartbeats double one at most."""
-_MIN_DOUBLED_RATIO = 1.6
+_MIN_DOUBLED_RATIO = 1.6  # heartbeats received over expected: two nodes have 2
 _MAX_WORKERS = 32
 _MAX_EVENTS = 1024
 _REQUEST_TIMEOUT_NS = 30_000_000

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 PRESS_THRESHOLD_SIGMA = 100.0  # about 0.3 % of the usual range
-RELEASE_THRESHOLD_SIGMA = 40.0
+RELEASE_THRESHOLD_SIGMA = 40.0  # far above noise, far below a press
 MIN_REACTION_SIGMA = 8.0  # change of a channel: less is no response to a press
 MIN_SECOND_PAD_FRACTION = 0.2  # current over the strongest pad's: a pad above this is pressed too
 _MIN_PRESS_NS = 300_000_000  # least duration of a press; its first third isn't used

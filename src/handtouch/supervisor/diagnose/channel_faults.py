@@ -20,9 +20,9 @@ from handtouch.wire.faults import FaultKind
 ALARM_NATS = 40.0
 """Nats; 15 pads of 200 Hz make 7e9 readings per week: 7e9 e^-40 is one false alarm in 600 million weeks."""
 
-_MIN_REPEATS = 200
-_MIN_RAILED_NS = 1_000_000_000
-_MIN_RAILED_TOUCHED_NS = 20_000_000_000
+_MIN_REPEATS = 200  # a second at 200 Hz, where noise would allow fewer
+_MIN_RAILED_NS = 1_000_000_000  # beside resting channels, as no contact is
+_MIN_RAILED_TOUCHED_NS = 20_000_000_000  # beside busy channels: longer than most firm presses
 _TOUCHED_CONFIDENCE = 0.6
 """Confidence of saturation when the other channels never rested, beyond the range of any contact."""
 _MAX_UNTOUCHED_FRACTION = 0.03
@@ -37,10 +37,10 @@ _MIN_FIRM_FRACTION, _MAX_FIRM_DEVIATION = 0.8, 0.15
 differ from the nominal one and the lowest currents of a contact that moves."""
 _MIN_SHORT_FRACTION = 0.75
 """Part of the current through an electrode's series resistor at which it may be shorted to the layer."""
-_MIN_CHANNELS_OF_SHORT = 2
+_MIN_CHANNELS_OF_SHORT = 2  # one more could be that of a contact
 _MAX_SILENT_SIGMA = 10.0
 """Lowest short mean of a channel without a current, of the noise of a reading."""
-_OPEN_OHM = 1e12
+_OPEN_OHM = 1e12  # stands for no connection
 _MIN_WINDOW_NS = 5_000_000_000
 """The lowest readings of the other channels are those of the last one to two such times."""
 _FAULT_CLEAR_NS = 2_000_000_000

@@ -21,6 +21,7 @@ from handtouch.supervisor.diagnose.model import FloatArray
 # what they yield.
 _ITERATIONS = 8
 _NON_POINT_SHARE_RANGE = (0.1, 0.7)
+"""Limits of its estimate, so that neither few nor many contacts decide alone."""
 _MAX_SCATTER = 4.0
 """Standard deviation of scores of points, at most; at least 1."""
 _LOG_NON_POINT_SPREAD = np.log(8.0)

@@ -51,7 +51,7 @@ _MIN_SEPARATION_LONG_NATS = 12.0
 """The same between gain steps and torn corners of a long pad, which show in two small currents."""
 CLEAR_NATS = 8.0
 """Margin of a pad without a fault over the diagnosed one that ends the diagnosis: odds of 3000, chosen."""
-_MAX_SUM_NATS = 4 * SUSPICION_NATS
+_MAX_SUM_NATS = 4 * SUSPICION_NATS  # bounds how long a sum outlives a mended fault
 _NATS_PER_LOGIT = 4.0
 """Evidence per logit of the stated confidence: what the model neglects is common to many contacts."""
 _WINDOWS = (64, 52, 44, 36, 28, 20, 12)
@@ -66,6 +66,7 @@ _MIN_CONTACTS, _MAX_STEP_CONTACTS = 6, 6
 """Contacts before the first comparison, and from one to the next while they find nothing new: chosen, against
 the cost of a comparison."""
 _MAX_SUSPECTS, _MAX_SUSPECTS_ALIKE = 16, 4
+"""Hypotheses of a joint comparison, and those of one kind: bounds its cost."""
 _GAIN_STEP_STD = 0.1
 """Standard deviation of a gain about that of a hypothesis, as factors are few."""
 _CALIBRATED_GAIN_STD = 0.005

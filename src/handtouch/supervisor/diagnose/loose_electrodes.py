@@ -27,7 +27,7 @@ MIN_STEPS = 3
 """Openings and closings of an electrode, at least one of each, within `MAX_AGE_NS`."""
 MIN_OPEN_CONTACTS = 6
 """Contacts without a current of an electrode that opened, after which it is dead."""
-MAX_AGE_NS = 60_000_000_000
+MAX_AGE_NS = 60_000_000_000  # steps of a minute: a loose wire moves with the hand
 END_TOUCHED_NS = 30_000_000_000
 """Time of contact without an opening or closing, after which the electrode isn't loose any more."""
 _LAGS = (1, 2)
@@ -36,14 +36,14 @@ _MIN_STEP_COUNTS, _MIN_STEP_FRACTION = 100.0, 0.06
 """Step of the channel that opens or closes; the fraction is of the total before an opening."""
 _MAX_OPEN_FRACTION, _MAX_OPEN_SIGMA = 0.04, 5.0
 """Reading of the open channel, of the step and of its noise."""
-_MIN_SCALE, _MAX_SCALE = 0.5, 1.15
+_MIN_SCALE, _MAX_SCALE = 0.5, 1.15  # total after a step, and step of the others, over those expected
 _MAX_MISFIT_FRACTION = 0.25
 """Misfit of the shares that the others take, of the step."""
 _MIN_MISFIT_RATIO = 2.5
 """Misfit without a redistribution, over that with it."""
 _DEAD_TIME_NS = 50_000_000
 """From one step of an electrode to the next."""
-_TOUCHED_COUNTS = 250.0
+_TOUCHED_COUNTS = 250.0  # sum of a contact, as in hand_diagnostics
 _STEPS_OF_DEAD = 2
 """Steps that count as much as the contacts after the opening of a dead electrode."""
 _MIN_RETURNED_COUNTS, _MIN_RETURNED_FRACTION = 100.0, 0.05

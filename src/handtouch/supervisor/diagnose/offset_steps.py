@@ -21,16 +21,16 @@ from handtouch.wire.faults import FaultKind
 # measure what they yield.
 CONFIRM_NS = 6_000_000_000
 """Time from a jump to its comparison; longer than the window of the lowest reading."""
-_MIN_STEP_COUNTS, _MIN_STEP_SIGMA = 25.0, 12.0
+_MIN_STEP_COUNTS, _MIN_STEP_SIGMA = 25.0, 12.0  # smaller steps are left to the baseline
 _MAX_OTHER_FRACTION, _MAX_OTHER_SIGMA = 0.002, 7.0
 """Change of each other channel, of the jump and of its noise."""
 _MAX_REST_FRACTION = 0.05
 """Change of any channel before and after, of the jump: a ramp is none."""
-_SAMPLES_OF_JUMP = 4
+_SAMPLES_OF_JUMP = 4  # two before and two after it
 _MAX_DIFFERENCE_COUNTS, _MAX_DIFFERENCE_FRACTION, _MAX_OTHER_DIFFERENCE_FRACTION = 5.0, 0.1, 0.03
 """Difference of the lowest reading from the former one plus the jump: counts, fraction of the jump in its
 channel and in others."""
-_CONFIDENCE = 0.998
+_CONFIDENCE = 0.998  # stated confidence of an offset: nothing else jumps in one channel and stays
 
 
 @dataclass(frozen=True)

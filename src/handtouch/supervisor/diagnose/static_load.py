@@ -23,12 +23,12 @@ from handtouch.wire.faults import FaultKind
 
 MIN_LOAD_COUNTS = 12.0
 """Sum of the channels' magnitudes above which a pad has a static load."""
-FLOOR_WINDOW_NS = 4_000_000_000
+FLOOR_WINDOW_NS = 4_000_000_000  # longer than a press in use, so that the lowest reading is the load's
 MIN_FAULT_PROBABILITY = 0.99
 """Probability at which a fault is reported; a held object at `_MIN_HELD_PROBABILITY`."""
 
-_MIN_HELD_PROBABILITY = 0.8
-_MAX_BLOCKS = 120
+_MIN_HELD_PROBABILITY = 0.8  # lower, as no fault is reported by it
+_MAX_BLOCKS = 120  # a minute of floors
 _MAX_ZERO_DRIFT_COUNTS_PER_S = 0.05  # rate at which the zero tracks the floor
 _CAUSES = (
     FaultKind.HELD_OBJECT,
@@ -61,13 +61,13 @@ _FEATURE_PROBABILITIES = {
 _TREMOR_CAUSES = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 _TREMOR_POSITION_STDS = np.geomspace(4e-4, 3e-2, 10)  # standard deviations of a held object's fractions
 _STILL_POSITION_STDS = np.array([0.0, 5e-5, 1.5e-4])
-_MAX_FLOOR_RATIO = 1.25
-_MAX_FADED_PART = 0.67
+_MAX_FLOOR_RATIO = 1.25  # readings above that are another press on top
+_MAX_FADED_PART = 0.67  # of a load that fades: what is left of it in its last third over its first
 _MIN_ABRUPT_PART = 0.35
 """Part of a load that appears within 3 s: a leak that grows with a time constant of 10 s or more has at most
 0.33 of what it has when it is classified, after 15 s; gum on a sheet that adapts, 0.4 and more."""
 _MIN_TREMOR_NATS = 3.0  # odds of 20
-_MAX_TREMOR_NATS, _MAX_STILL_NATS = 15.0, 3.0
+_MAX_TREMOR_NATS, _MAX_STILL_NATS = 15.0, 3.0  # stillness says little: firm robots hold still
 _LASTING_CAUSES = np.array([0.0, 1.0, 0.0, 1.0, 1.0, 0.0])
 _PRESS_NATS, _MAX_PRESS_NATS = 1.5, 9.0
 """Evidence of a press elsewhere on the pad, after which the load is as before, and its greatest sum. Chosen:
@@ -84,8 +84,8 @@ _AFTER_PRESS_NS = 1_500_000_000
 """Time after a press in which the sheet relaxes too fast for the search of tremor."""
 _SAME_BEGIN_NS = 1_000_000_000
 """From the begin of a load to a step that explains it."""
-_BEGIN_COUNTS = 250.0
-_MIN_SCATTER_BLOCKS = 6
+_BEGIN_COUNTS = 250.0  # sum of a contact, as in hand_diagnostics
+_MIN_SCATTER_BLOCKS = 6  # three seconds without a press
 _NOISE_GAIN = 0.05  # gain of the noise estimate per block without a load
 
 
