@@ -27,6 +27,8 @@ from handtouch.view.page.meshes import (
 
 FloatArray = NDArray[np.float64]
 Pose = tuple[FloatArray, FloatArray]
+_MAX_CORNERS = 150_000
+"""Corners of a link's visual shapes above which its collision shapes are drawn: 50,000 triangles, 3.6 MB"""
 _HAND_SPACING_M = 0.06
 """Between hands."""
 _PAD_GAP_M = 0.008
@@ -133,14 +135,10 @@ def _add_robot(
     waiting = list(robot.joints.values())
     while waiting:  # a parent may come later in the file than its child
         waiting = [joint for joint in waiting if not _add_joint(scene, hand, joint, numbers)]
-    missing = []
+    missing: list[str] = []
     for link, number in numbers.items():
-        for shape in robot.bodies[link]:
-            mesh = body_mesh(shape, robot.path.parent)
-            if mesh is None:
-                missing.append(shape.file)
-            else:
-                scene.add_body(number, mesh)
+        for mesh in _body_meshes(robot, link, missing):
+            scene.add_body(number, mesh)
     if missing:
         scene.problems.append(
             f"{hand.name}: {len(missing)} meshes can't be loaded, such as {missing[0]}; put them beside the "
@@ -149,6 +147,21 @@ def _add_robot(
     return _group_by_digit(
         hand, [scene.add_pad(hand, pad, numbers[pad.mount.link or pad.link]) for pad in hand.pads]
     )
+
+
+def _body_meshes(robot: RobotDescription, link: str, missing: list[str]) -> list[TriangleMesh]:
+    """Return the visual shapes of a link where all can be loaded and drawn, else its collision shapes.
+
+    `missing` is extended by the files of collision shapes that can't be loaded.
+    """
+    folder = robot.path.parent
+    seen = [body_mesh(shape, folder) for shape in robot.visible.get(link, ())]
+    loaded = [mesh for mesh in seen if mesh is not None]
+    if loaded and len(loaded) == len(seen) and sum(len(mesh.corners_m) for mesh in loaded) < _MAX_CORNERS:
+        return loaded
+    found = [(shape, body_mesh(shape, folder)) for shape in robot.bodies[link]]
+    missing.extend(shape.file for shape, mesh in found if mesh is None)
+    return [mesh for _, mesh in found if mesh is not None]
 
 
 def _add_joint(scene: _SceneGraph, hand: HandTable, joint: urdf.UrdfJoint, numbers: dict[str, int]) -> bool:

@@ -11,6 +11,8 @@ export const LEGEND = [
 ];
 export const BODY = [0.36, 0.4, 0.46];
 export const CONTACT = "#ff5a1f";
+export const EMPTY = "#1a2028";
+const FULL_FORCE_N = 5;
 export const ELLIPSE = "#ffe9a8";
 
 export const rgb = (hex) => [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);
@@ -22,6 +24,13 @@ export function statusText(pad) {
   const status = statusOf(pad), node = pad?.node_state;
   if (status === "clear") return "ok";
   return node && node !== "operational" && node !== status ? `${status}, node ${node}` : status;
+}
+
+// Colour that fills a pad by the root of its force, so that light touches show, too.
+export function fillOf(contact) {
+  const part = Math.min(1, Math.sqrt(Math.max(0, contact?.force_n ?? 0) / FULL_FORCE_N));
+  const mixed = rgb(EMPTY).map((from, k) => Math.round(255 * (from + (rgb(CONTACT)[k] - from) * part)));
+  return `rgb(${mixed.join(" ")})`;
 }
 
 // Colour of a pad's trail and force history.

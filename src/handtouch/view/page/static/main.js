@@ -8,7 +8,7 @@ import { Tooltip } from "./tooltip.js";
 import { drawMagnification, drawPercepts, drawLegend, drawMessages, drawNodes, drawService } from "./text_panel.js";
 
 const state = {
-  connected: false, alive: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, percepts: {}, percepts_enabled: false, messages: [], time_s: 0,
+  connected: false, alive: false, filled: false, scene: null, service: null, joints: {}, pads: {}, contacts: {}, percepts: {}, percepts_enabled: false, messages: [], time_s: 0,
 };
 const counts = { updates: 0, frames: 0 };
 const SLOW_MS = 40;
@@ -17,6 +17,10 @@ const hand = new HandView(byId("hand"), byId("labels"));
 const pads = new PadsView(byId("pads"));
 const tooltip = new Tooltip(byId("tooltip"));
 const history = new HistoryView(byId("history"));
+byId("fill").addEventListener("change", (event) => {
+  state.filled = event.target.checked;
+  redraw();
+});
 let numbers = new Map(); // of pads, by key
 let dirty = true;
 

@@ -1,6 +1,6 @@
 // Every pad unrolled, seen from outside with x0 below, arranged as on the hand: contacts and their trails.
 
-import { CONTACT, STATUS_SIGNS, colourOf, forceText, colourOfStatus, statusOf } from "./colours.js";
+import { CONTACT, EMPTY, STATUS_SIGNS, colourOf, fillOf, forceText, colourOfStatus, statusOf } from "./colours.js";
 
 const TRAIL_S = 4, GAP = 6, LABEL = 26, HEADER = 16, REACH_PX = 5;
 
@@ -68,7 +68,7 @@ export class PadsView {
     context.beginPath();
     pad.outline.forEach(([u, offset]) => context.lineTo(...toCanvas(u, offset)));
     context.closePath();
-    context.fillStyle = "#1a2028";
+    context.fillStyle = state.filled ? fillOf(contact) : EMPTY;
     context.fill();
     context.lineWidth = 1.5;
     context.strokeStyle = colourOfStatus(health);
