@@ -99,8 +99,8 @@ def find_warnings(deployment: config.Deployment) -> Iterator[str]:
     for entry in deployment.pads:
         for text in _pad_warnings(entry.pad, deployment):
             alike.setdefault(text, []).append(entry.name)
-    for text, names in alike.items():
-        yield f"{', '.join(names)}: {text}"
+    for text, pads in alike.items():
+        yield f"{', '.join(pads)}: {text}"
 
 
 def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[str]:
