@@ -7,7 +7,7 @@ from functools import partial
 
 from handtouch.canbus import cia301
 from handtouch.device.object_values import ObjectValues
-from handtouch.device.scheduler import DeviceHost
+from handtouch.device.scheduler import DeviceHost, JobGroup
 
 _GUARD_TIME, _LIFE_TIME_FACTOR = (cia301.GUARD_TIME, 0), (cia301.LIFE_TIME_FACTOR, 0)
 HEARTBEAT_TIME = (cia301.HEARTBEAT_TIME, 0)
@@ -31,24 +31,20 @@ class ErrorControl:
         self._bus, self._objects, self._send = bus, objects, send
         self._on_life_time_expired = on_life_time_expired
         self._toggle_bit = 0
-        # jobs of an earlier generation are void
-        self._heartbeat_generation = self._guard_generation = 0
+        self._heartbeat, self._life_time = JobGroup(bus), JobGroup(bus)
 
     def stop(self) -> None:
         """Send no more heartbeats, and end the guarding."""
         self._toggle_bit = 0
-        self._heartbeat_generation += 1
-        self._guard_generation += 1
+        self._heartbeat.stop()
+        self._life_time.stop()
 
     def start_heartbeat(self) -> None:
         """Send heartbeats with the period in 0x1017 from now on, none if it is 0."""
-        self._heartbeat_generation += 1
+        self._heartbeat.stop()
         period_ns = self._objects.get_integer(*HEARTBEAT_TIME) * _MS
         if period_ns:
-            self._bus.schedule(
-                self._bus.now_ns + period_ns,
-                partial(self._emit_heartbeat, self._heartbeat_generation, period_ns),
-            )
+            self._heartbeat.schedule(self._bus.now_ns + period_ns, partial(self._emit_heartbeat, period_ns))
 
     def handle_guard_request(self, now_ns: int) -> None:
         """Respond to a guarding request with state and toggle bit, and restart the life time."""
@@ -58,16 +54,10 @@ class ErrorControl:
         self._send(self._toggle_bit)
         self._toggle_bit ^= 0x80
         life_ns = get(*_GUARD_TIME) * get(*_LIFE_TIME_FACTOR) * _MS
-        self._guard_generation += 1
+        self._life_time.stop()
         if life_ns:
-            self._bus.schedule(now_ns + life_ns, partial(self._expire_life_time, self._guard_generation))
+            self._life_time.schedule(now_ns + life_ns, lambda *_: self._on_life_time_expired())
 
-    def _emit_heartbeat(self, generation: int, period_ns: int, due_ns: int, now_ns: int) -> int | None:
-        if generation != self._heartbeat_generation:
-            return None
+    def _emit_heartbeat(self, period_ns: int, due_ns: int, now_ns: int) -> int:
         self._send(0)
         return due_ns + period_ns * (1 + (now_ns - due_ns) // period_ns)
-
-    def _expire_life_time(self, generation: int, *_: int) -> None:
-        if generation == self._guard_generation:
-            self._on_life_time_expired()

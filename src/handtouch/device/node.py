@@ -16,7 +16,7 @@ from handtouch.device.error_control import HEARTBEAT_TIME, ErrorControl
 from handtouch.device.faults import FaultSwitches
 from handtouch.device.object_values import ObjectValues
 from handtouch.device.pdo import DeviceTpdo
-from handtouch.device.scheduler import DeviceHost
+from handtouch.device.scheduler import DeviceHost, JobGroup
 from handtouch.device.sdo import DeviceSdoServer
 from handtouch.device.spec import DeviceSpec
 
@@ -44,8 +44,7 @@ class Device(FaultSwitches):
         self._is_bus_off = False
         self._counts_sample = -1
         self._noise = random.Random(node_id)
-        # jobs of an earlier generation are void
-        self._power_generation = self._babble_generation = self._boot_loop_generation = 0
+        self._power, self._babble, self._boot_loop = JobGroup(bus), JobGroup(bus), JobGroup(bus)
         self._latched_error: tuple[int, int, bytes] | None = None
         self._channels = {address: channel for channel, address in enumerate(spec.channels)}
         dictionary = spec.load_dictionary(node_id)
@@ -86,14 +85,14 @@ class Device(FaultSwitches):
     def plug(self) -> None:
         """Power on: boot-up message, defaults, pre-operational; no effect if powered."""
         with self._bus.lock:
-            self._power_generation += 1
+            self._power.stop()
             if not self.plugged:
                 self._boot(power=True)
 
     def unplug(self) -> None:
         """Power off: neither send nor receive until `plug`."""
         with self._bus.lock:
-            self._power_generation += 1
+            self._power.stop()
             self.plugged = self._is_bus_off = False
             self._error_control.stop()
             self.refresh()
@@ -111,17 +110,15 @@ class Device(FaultSwitches):
             )
         with self._bus.lock:
             self.unplug()
-            restore = partial(self._restore_power, self._power_generation, (away_ns, times - 1, every_ns))
-            self._bus.schedule(self._bus.now_ns + away_ns, restore)
+            restore = partial(self._restore_power, away_ns, times - 1, every_ns)
+            self._power.schedule(self._bus.now_ns + away_ns, restore)
 
     def bus_off(self, away_ns: int, *, boots: bool = False) -> None:
         """Neither send nor receive for `away_ns`; then continue, or boot if `boots`."""
         with self._bus.lock:
             self._is_bus_off = self.plugged
             self.refresh()
-            self._bus.schedule(
-                self._bus.now_ns + away_ns, partial(self._leave_bus_off, self._power_generation, boots)
-            )
+            self._power.schedule(self._bus.now_ns + away_ns, partial(self._leave_bus_off, boots))
 
     def replace_device(self, serial: int) -> None:
         """Replace it by another device of the same kind."""
@@ -190,31 +187,28 @@ class Device(FaultSwitches):
         if period_ns <= 0:
             raise ValueError(f"need period_ns > 0, got {period_ns}")
         with self._bus.lock:
-            self._boot_loop_generation += 1
-            loop = partial(self._reboot_repeatedly, self._boot_loop_generation, period_ns)
-            self._bus.schedule(self._bus.now_ns, loop)
+            self._boot_loop.stop()
+            self._boot_loop.schedule(self._bus.now_ns, partial(self._reboot_repeatedly, period_ns))
 
     def stop_boot_loop(self) -> None:
         """Stop what `start_boot_loop` started."""
-        self._boot_loop_generation += 1
+        self._boot_loop.stop()
 
     def start_babbling(self, rate_hz: float, identifier: int | None = None, data: bytes = bytes(8)) -> None:
         """Send a frame at a high rate in any NMT state, by default with the identifier of its first TPDO."""
         if rate_hz <= 0 or not 0 <= (identifier or 0) <= cia301.IDENTIFIER_MASK:
             raise ValueError(f"need rate_hz > 0 and an 11-bit identifier, got {rate_hz} and {identifier}")
         with self._bus.lock:
-            self._babble_generation += 1
+            self._babble.stop()
             frame = _message(
                 self._tpdos[0].message.arbitration_id if identifier is None else identifier, data
             )
             period_ns = max(round(1e9 / rate_hz), 1)
-            self._bus.schedule(
-                self._bus.now_ns, partial(self._send_babble, self._babble_generation, frame, period_ns)
-            )
+            self._babble.schedule(self._bus.now_ns, partial(self._send_babble, frame, period_ns))
 
     def stop_babbling(self) -> None:
         """Stop what `start_babbling` started."""
-        self._babble_generation += 1
+        self._babble.stop()
 
     def refresh(self) -> None:
         """Apply a change of switches, settings or state to the TPDOs sent."""
@@ -410,40 +404,22 @@ class Device(FaultSwitches):
 
     # Scheduled jobs.
 
-    def _reboot_repeatedly(self, generation: int, period_ns: int, _due_ns: int, now_ns: int) -> int | None:
-        if generation != self._boot_loop_generation:
-            return None
+    def _reboot_repeatedly(self, period_ns: int, _due_ns: int, now_ns: int) -> int:
         self.reboot()
         return now_ns + period_ns
 
-    def _send_babble(
-        self, generation: int, frame: can.Message, period_ns: int, due_ns: int, now_ns: int
-    ) -> int | None:
-        if generation != self._babble_generation:
-            return None
+    def _send_babble(self, frame: can.Message, period_ns: int, due_ns: int, now_ns: int) -> int:
         self.transmit(frame, is_data=True)
         return max(due_ns + period_ns, now_ns - _MAX_BACKLOG_NS)
 
-    def _restore_power(
-        self, generation: int, remaining: tuple[int, int, int], due_ns: int, _now_ns: int
-    ) -> None:
-        if generation != self._power_generation:
-            return  # it was switched meanwhile
+    def _restore_power(self, away_ns: int, times: int, every_ns: int, due_ns: int, _now_ns: int) -> None:
         self.plug()
-        away_ns, times, every_ns = remaining
         if times:
-            self._bus.schedule(
-                due_ns + every_ns - away_ns,
-                partial(self._repeat_brown_out, self._power_generation, remaining),
-            )
+            again = partial(self.brown_out, away_ns, times=times, every_ns=every_ns)
+            self._power.schedule(due_ns + every_ns - away_ns, lambda *_: again())
 
-    def _repeat_brown_out(self, generation: int, remaining: tuple[int, int, int], *_: int) -> None:
-        if generation == self._power_generation:
-            away_ns, times, every_ns = remaining
-            self.brown_out(away_ns, times=times, every_ns=every_ns)
-
-    def _leave_bus_off(self, generation: int, boots: bool, *_: int) -> None:
-        if generation != self._power_generation or not self._is_bus_off:
+    def _leave_bus_off(self, boots: bool, *_: int) -> None:
+        if not self._is_bus_off:
             return
         self._is_bus_off = False
         self.refresh()

@@ -6,6 +6,7 @@ import heapq
 import itertools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import Protocol
 
 import can
@@ -33,6 +34,24 @@ class DeviceHost(Protocol):
     def electrode_counts(self, row: int) -> list[int]: ...
 
     def transmit(self, message: can.Message) -> None: ...
+
+
+class JobGroup:
+    """Jobs of a bus that `stop` voids."""
+
+    def __init__(self, bus: DeviceHost) -> None:
+        self._bus, self._stops = bus, 0
+
+    def schedule(self, due_ns: int, job: ScheduledJob) -> None:
+        """Add a job."""
+        self._bus.schedule(due_ns, partial(self._run, self._stops, job))
+
+    def stop(self) -> None:
+        """Void the jobs added so far."""
+        self._stops += 1
+
+    def _run(self, stops: int, job: ScheduledJob, due_ns: int, now_ns: int) -> int | None:
+        return job(due_ns, now_ns) if stops == self._stops else None
 
 
 class Scheduler:
