@@ -111,13 +111,13 @@ class LssMaster:
                     except LssError:
                         problem = _UNDETERMINED
                         continue
-                    compares[address] = not self._answers_contradiction()
+                    compares[address] = not self.answers_contradiction()
                     if count > 1:
                         self.problems.append(_describe_duplicate(address))
         except LssError as error:
             problem = str(error)
         finally:
-            self._deselect_all()
+            self.deselect_all()
         if problem:
             self.problems.append(problem)
         return sorted(compares)
@@ -128,7 +128,7 @@ class LssMaster:
             self._select(address)
             answer = self._request(struct.pack("<B7x", cia305.INQUIRE_ID), cia305.INQUIRE_ID, _SELECT_WAIT_S)
         finally:
-            self._deselect_all()
+            self.deselect_all()
         if answer is None:
             raise LssError(f"{address}: no response to the inquiry of its id")
         return None if answer[1] == cia305.UNCONFIGURED else answer[1]
@@ -153,7 +153,7 @@ class LssMaster:
                 raise LssError(f"{address}: id {node_id} not accepted: {reason}")
             answer = self._request(struct.pack("<B7x", cia305.STORE), cia305.STORE, _STORE_WAIT_S)
         finally:
-            self._deselect_all()
+            self.deselect_all()
         self._confirm_waiting()  # the node uses its id from the waiting state on
         if answer is None:
             return f"no answer within {_STORE_WAIT_S:g} s"
@@ -168,13 +168,13 @@ class LssMaster:
         None: search all
         """
         found: set[LssAddress] = set()
-        self._deselect_all()
+        self.deselect_all()
         if not self._start_search():
             return found, ""
         self._confirm_waiting()
         for address in excluded:
-            self._request_selection(address)
-        if excluded and self._answers_contradiction():
+            self.request_selection(address)
+        if excluded and self.answers_contradiction():
             self._confirm_waiting()
         self._mismatches, self._is_incomplete = 0, False
         self._response_timer.reset_backoff()
@@ -235,7 +235,7 @@ class LssMaster:
                 values += self._find_values(path, first_only, value, bit - 1) if bit else [value]
                 if first_only and values:
                     break
-                if not bit and part == _SERIAL_PART and self._answers_contradiction():
+                if not bit and part == _SERIAL_PART and self.answers_contradiction():
                     self._confirm_waiting()  # some nodes are selected by their serial number already
                     self._enter(path)
             if len(values) > _MAX_VALUES:
@@ -296,7 +296,7 @@ class LssMaster:
         problem = ""
         for _ in range(2):
             self._confirm_waiting()
-            if not self._request_selection(address):
+            if not self.request_selection(address):
                 problem = problem or f"{address}: no response any more"
                 continue
             responses = [self._inquire(command) for command in cia305.INQUIRE]
@@ -305,7 +305,7 @@ class LssMaster:
             problem = f"{address}: a node with another identity responds to its selection"
         raise LssError(problem)
 
-    def _request_selection(self, address: LssAddress) -> bool:
+    def request_selection(self, address: LssAddress) -> bool:
         """Switch a waiting node to the configuration state; return False if it doesn't respond."""
         answer = None
         for command, value in zip(cia305.SELECT, address.parts, strict=True):
@@ -331,20 +331,20 @@ class LssMaster:
     def _confirm_waiting(self) -> None:
         """Switch all nodes to the waiting state until none responds to a contradiction. Raises LssError."""
         for attempt in range(_MAX_ATTEMPTS):
-            self._deselect_all()
-            if not self._answers_contradiction():
+            self.deselect_all()
+            if not self.answers_contradiction():
                 return
             self._exchange(None, self._response_timer.min_wait_s * 2**attempt)
         raise LssError(_NOT_COMPARING)
 
-    def _answers_contradiction(self) -> bool:
+    def answers_contradiction(self) -> bool:
         """Return True if a node responds to fast scans whatever their data."""
         return all(
             self._has_match(_scan_request(serial, 0, _SERIAL_PART, _SERIAL_PART), patience=2.0)
             for serial in _CONTRADICTION
         )
 
-    def _deselect_all(self) -> None:
+    def deselect_all(self) -> None:
         """Switch all nodes to the waiting state; they don't respond, but some need time for it."""
         self._exchange(
             struct.pack("<BB6x", cia305.SWITCH_GLOBAL, cia305.WAITING_STATE), self._response_timer.min_wait_s

@@ -35,13 +35,6 @@ class Identification:
 
 
 @dataclass(frozen=True, slots=True)
-class TransmissionSet:
-    """Result of `set_transmission`: the node is event-driven (`idle`) or synchronous."""
-
-    idle: bool
-
-
-@dataclass(frozen=True, slots=True)
 class NodeConfigured:
     """Result of `configure_node`."""
 

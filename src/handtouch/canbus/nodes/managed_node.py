@@ -27,7 +27,8 @@ from handtouch.canbus.objects.mapping import PdoMapping, mapping_from_eds, read_
 from handtouch.canbus.objects.sdo import BootStepCancelled, BootStepError, NodeSdoClient, SdoTransport
 
 StepOutcome = StepDone | StepFailed
-StepResult = boot.Identification | ReportedErrors | PdoMapping | boot.NodeConfigured | boot.TransmissionSet
+StepResult = boot.Identification | ReportedErrors | PdoMapping | boot.NodeConfigured | bool
+"""Of SET_TRANSMISSION: the node is event-driven now, not synchronous."""
 
 NMT_COMMANDS = {
     NodeAction.START: cia301.START_NODE,
@@ -180,7 +181,7 @@ def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle:
         return None
     if step is NodeAction.SET_TRANSMISSION:
         boot.set_transmission(sdo, node.mapping.tpdos[0], idle)
-        return boot.TransmissionSet(idle)
+        return idle
     return boot.configure_node(sdo, node.mapping, spec, enter_preoperational, node.booted)
 
 

@@ -464,8 +464,8 @@ class Master:
         self, node: ManagedNode, outcome: StepOutcome, result: StepResult | None, now_ns: int
     ) -> None:
         node.transmission_pending = False
-        if isinstance(result, boot.TransmissionSet):
-            self._record_transmission(node, result.idle, now_ns)
+        if isinstance(result, bool):
+            self._record_transmission(node, result, now_ns)
         elif isinstance(outcome, StepFailed):
             # not requested again until the node boots
             node.can_idle = node.idle
