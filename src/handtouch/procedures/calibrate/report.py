@@ -137,9 +137,9 @@ def _radius_lines(report: CalibrationReport) -> list[str]:
 
 
 def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
-    """Return the report for `json.dumps`; unknown values are None."""
+    """Return the report as plain values; unknown ones are NaN."""
     fit = report.fit
-    record = {
+    return {
         "pad": report.pad,
         "law": asdict(fit.law),
         "radius_evidence": fit.evidence,
@@ -156,15 +156,6 @@ def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
         "remarks": list(fit.remarks),
         **more,
     }
-    return {key: _finite_or_none(value) for key, value in record.items()}
-
-
-def _finite_or_none(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _finite_or_none(item) for key, item in value.items()}
-    return [_finite_or_none(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _rms(values: Sequence[float]) -> float:
