@@ -75,6 +75,12 @@ class Machine:
         rate = link.get("linkinfo", {}).get("info_data", {}).get("bittiming", {}).get("bitrate")
         return rate if isinstance(rate, int) else None
 
+    def restart_ms(self, name: str) -> int | None:
+        """Return the delay after which the kernel restarts a SocketCAN interface after bus-off [ms], 0 for
+        never; None if unknown, or for an interface that can't go bus-off."""
+        info = (self.read_link(name) or {}).get("linkinfo", {})
+        return int(info.get("info_data", {}).get("restart_ms", 0)) if info.get("info_kind") == "can" else None
+
     def raw_socket_problem(self) -> tuple[str, str] | None:
         """Return why a raw CAN socket can't be opened, with the remedy."""
         try:

@@ -1,13 +1,11 @@
 """A CAN bus, opened by python-can's interface name and channel: receive, send, counters, state.
 
-Public names: `Port`, `open_bus`, `BusError`, `query_restart_ms`.
+Public names: `Port`, `open_bus`, `BusError`.
 """
 
 from __future__ import annotations
 
 import errno
-import json
-import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -34,7 +32,7 @@ from handtouch.canbus.bus.router import BusCounters, CanFrame, Router
 from handtouch.canbus.bus.sockets import DatagramReceiver, SocketcanReceiver
 from handtouch.config import Bus
 from handtouch.core.slab import Slab
-from handtouch.host.machine import NoRouteError, check_multicast_route
+from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
 _SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
@@ -193,7 +191,7 @@ class Port:
 
     def _query_restart_ms(self) -> None:
         """Query the kernel's restart delay; in a thread, since starting a program takes milliseconds."""
-        self.bus_state.restart_ms = query_restart_ms(str(self.bus.channel))
+        self.bus_state.restart_ms = Machine().restart_ms(str(self.bus.channel))
 
 
 def open_bus(bus: Bus) -> can.BusABC:
@@ -207,20 +205,6 @@ def open_bus(bus: Bus) -> can.BusABC:
         return can.Bus(channel=bus.channel, interface=bus.interface, ignore_config=True, **options)
     except Exception as error:  # drivers raise anything
         raise _open_error(bus, error) from error
-
-
-def query_restart_ms(channel: str) -> int | None:
-    """Return the delay after which the kernel restarts a SocketCAN interface after bus-off [ms], 0 for never.
-
-    None if unknown: without iproute2, or for an interface that can't go bus-off.
-    """
-    command = ["ip", "-details", "-json", "link", "show", "dev", channel]
-    try:
-        process = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-        link = json.loads(process.stdout)[0]["linkinfo"]
-        return int(link["info_data"].get("restart_ms", 0)) if link["info_kind"] == "can" else None
-    except (OSError, ValueError, LookupError, TypeError, subprocess.SubprocessError):
-        return None
 
 
 def _open_receiver(bus: Bus, opener: Callable[[], can.BusABC]) -> Receiver:
