@@ -110,10 +110,10 @@ def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_cl
     files = {path.name.partition("-")[0]: path for path in folder.glob("*.so")}
     tables = files["tables"].read_bytes()
     untouched = {
-        path.name: path.stat().st_ino for name, path in files.items() if name not in ("tables", "receive")
+        path.name: path.stat().st_ino for name, path in files.items() if name not in ("tables", "groups")
     }
     files["tables"].unlink()
-    with (copied / "handtouch/core/stages/receive.py").open("a") as file:
+    with (copied / "handtouch/core/stages/groups.py").open("a") as file:
         file.write("# edited\n")
     cache = copied.parent / "cache"
     done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache))
@@ -121,11 +121,11 @@ def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_cl
     after = {path.name: path.stat().st_ino for path in folder.iterdir()}
     assert len(after) == len(files)
     assert untouched.items() <= after.items()
-    assert files["receive"].name not in after
+    assert files["groups"].name not in after
     assert files["tables"].read_bytes() == tables
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
     reused = list((cache / "handtouch/compiled").iterdir())
-    assert {file.name.partition("-")[0] for file in reused} == {"tables", "receive"}
+    assert {file.name.partition("-")[0] for file in reused} == {"tables", "groups"}
     for file in reused:
         (folder / file.name).unlink()
     done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache), CC="/bin/false")
@@ -144,7 +144,8 @@ build_stages(Path({str(copied)!r}), {other!r})"
 
 def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -> None:
     shutil.rmtree(copied / "handtouch/core/stages/_compiled", ignore_errors=True)
-    failed = run("-m", "handtouch.core.build", source=copied, PATH="/nowhere", CC="")
+    build, cache = ("-m", "handtouch.core.build"), str(copied.parent)
+    failed = run(*build, source=copied, PATH="/nowhere", CC="", XDG_CACHE_HOME=cache)
     assert failed.returncode == 1
     assert "apt-get install build-essential" in failed.stderr
     compiled, used, *reason = run("-c", STATE, source=copied).stdout.split()
