@@ -86,7 +86,7 @@ others: $(VENV)/.dev $(VENV)/.core
 
 # for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
-	@$(MAKE) --no-print-directory unit ARGS="--within 80 $(ARGS)"
+	@$(MAKE) --no-print-directory unit ARGS="-n 2 --within 80 $(ARGS)"
 
 lint: $(VENV)/.dev ## check style
 	$(BIN)/ruff check
