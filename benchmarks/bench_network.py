@@ -288,7 +288,7 @@ def noise_cost(report: Report) -> None:
 
 def neighbours(model: ForwardModel) -> float | str:
     """Conductance between electrodes x0 and y0; nothing to say of divided sides, or without gaps."""
-    if isinstance(model, ElectrodeNetwork) and len(model.electrodes) == len(SIDES):
+    if isinstance(model, ElectrodeNetwork) and len(model.series_ohm) == len(SIDES):
         return float(-model.conductance[0, 2])
     return ""
 
@@ -300,7 +300,7 @@ def divided(aspect: float, across: int, along: int | None = None) -> ElectrodeNe
         length, count = (1.0, across) if side[0] == "x" else (aspect, along or across)
         cuts = np.linspace(0.01, length - 0.01, count + 1)
         pieces += [Electrode(side, low + 0.01, high - 0.01) for low, high in itertools.pairwise(cuts)]
-    return ElectrodeNetwork.from_electrodes(aspect, 1.0, pieces, SHEET)
+    return ElectrodeNetwork.from_sides(aspect, 1.0, pieces, SHEET)
 
 
 def expected_error_anisotropic(aspect: float) -> FloatArray:

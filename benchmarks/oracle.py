@@ -225,6 +225,6 @@ class PadOracle:
         for number, side in enumerate(("y0", "yb"), 2):
             ends, _ = surface.to_rectangle([before[number], length_m - after[number]], [0.0, 0.0])
             electrodes.append(Electrode(side, float(stretch * ends[0]), float(stretch * ends[1])))  # type: ignore[arg-type]
-        return ElectrodeNetwork.from_electrodes(
+        return ElectrodeNetwork.from_sides(
             stretch * surface.a, surface.b, electrodes, sheet_ohm, self._hidden.series_ohm
         )

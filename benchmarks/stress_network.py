@@ -334,14 +334,14 @@ def arguments(_share: float) -> Iterator[Row]:
     ]
     pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
     pieces = [Electrode(side, start, stop) for side in SIDES for start, stop in ((0.02, 0.48), (0.52, 0.98))]
-    parted = ElectrodeNetwork.from_electrodes(1.0, 1.0, pieces, 2400.0)
+    parted = ElectrodeNetwork.from_sides(1.0, 1.0, pieces, 2400.0)
 
     def four(x: Any, y: Any) -> FloatArray:
         return np.stack(np.broadcast_arrays(x, y, 0.2, 0.3))
 
     functions: dict[str, Callable[[Any, Any], npt.ArrayLike]] = {
         "network.estimate": lambda x, y: pad.estimate(four(x, y), 0.01).x,
-        "from_electrodes.currents": parted.currents,
+        "from_sides.currents": parted.currents,
         "with_series.currents": pad.with_series_ohm((0.0, 0.0, 500.0, 1e-3)).currents,
         "Sandwich.currents": lambda x, y: pair.currents(x, y, 12.0, 0.02),
         "Sandwich.force": lambda x, y: pair.force(np.stack(np.broadcast_arrays(x, y)), 12.0, 0.02).force_n,

@@ -19,7 +19,6 @@ from handtouch.calibration.gains import (
 )
 from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
-from handtouch.field.perimeter_network import PerimeterNetwork
 
 FloatArray = NDArray[np.float64]
 SQUARE = Rectangle(1.0, 1.0)
@@ -296,10 +295,12 @@ def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
 
     def with_gaps(more: FloatArray) -> ElectrodeNetwork:
         electrodes = [
-            Electrode(electrode.side, electrode.start + before, electrode.stop - after)
-            for electrode, (before, after) in zip(nominal.electrodes, more.reshape(4, 2), strict=True)
+            Electrode(side, 0.8 + before, length - 0.8 - after)
+            for side, length, (before, after) in zip(
+                ("x0", "xa", "y0", "yb"), (24, 24, 30, 30), more.reshape(4, 2), strict=True
+            )
         ]
-        return ElectrodeNetwork.from_electrodes(30.0, 24.0, electrodes, 1.0)
+        return ElectrodeNetwork.from_sides(30.0, 24.0, electrodes, 1.0)
 
     parts = [with_gaps(0.1 * one) for one in np.eye(8)]
     distances: dict[bool, list[float]] = {False: [], True: []}
@@ -345,7 +346,7 @@ def test_invalid_calls_are_refused() -> None:
         estimator.add_contacts(np.ones(4), 1e-3, 9)
 
 
-SIX = PerimeterNetwork(1.4, 1.0, [[k * 0.8 + 0.05, k * 0.8 + 0.75] for k in range(6)], 1.0)
+SIX = ElectrodeNetwork.from_arcs(1.4, 1.0, [[k * 0.8 + 0.05, k * 0.8 + 0.75] for k in range(6)], 1.0)
 
 
 def test_gains_of_six_channels_match_their_covariance_and_the_fisher_bound() -> None:
@@ -365,7 +366,7 @@ def test_gains_of_six_channels_match_their_covariance_and_the_fisher_bound() -> 
 
 
 def test_three_channels_are_refused_as_contacts_leave_nothing_over() -> None:
-    three = PerimeterNetwork(1.0, 1.0, [[0.1, 1.2], [1.4, 2.5], [2.7, 3.9]], 1.0)
+    three = ElectrodeNetwork.from_arcs(1.0, 1.0, [[0.1, 1.2], [1.4, 2.5], [2.7, 3.9]], 1.0)
     estimator = plain(three)
     assert estimator.estimate.status == GainStatus.INVALID
     assert gain_deviation(three) == np.inf

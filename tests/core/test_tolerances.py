@@ -16,7 +16,6 @@ from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE
 from handtouch.core.pad_model import PadModel
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
 from tests.deployments import deployment_text, pad_text
@@ -180,7 +179,7 @@ def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_f
 
 
 def solve(
-    model: PadModel, xy: FloatArray, networks: Sequence[RectangleNetwork] | None = None,
+    model: PadModel, xy: FloatArray, networks: Sequence[ElectrodeNetwork] | None = None,
     gains: FloatArray | float = 1.0, rng: np.random.Generator | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return covariances (3, 3, 3), positions and normals (3, 3) of contacts at xy (3, 2), in sides."""
@@ -212,7 +211,7 @@ def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Ge
     return np.array(found)
 
 
-def sides(networks: Sequence[RectangleNetwork]) -> FloatArray:
+def sides(networks: Sequence[ElectrodeNetwork]) -> FloatArray:
     return np.array([(network.a, network.b) for network in networks])
 
 

@@ -18,7 +18,7 @@ from handtouch.config.channels import resolve_channels
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.device import Device, DeviceBus
 from handtouch.device.faults import LineFaults
-from handtouch.field import PerimeterNetwork, ScheduledNetwork
+from handtouch.field import ElectrodeNetwork
 from handtouch.hand import pad_network
 from handtouch.record.recording import Recording
 
@@ -41,12 +41,11 @@ class Finger:
     def __init__(self, deployment: Deployment) -> None:
         self._pads = [entry.pad for entry in deployment.pads]
         tip = pad_network(self._pads[0], deployment.sheets["soft"])
-        assert isinstance(tip, ScheduledNetwork)
-        assert isinstance(tip.network, PerimeterNetwork)
+        always = ElectrodeNetwork.from_arcs(tip.a, tip.b, tip.arcs, tip.sheet_ohm_per_square)
         self.a, self.b = tip.a, tip.b
         # each state by itself, not the sum of both that the daemon has
         self._states = [
-            tip.network.with_series_ohm([20.0 if k in state else math.inf for k in range(8)])
+            always.with_series_ohm([20.0 if k in state else math.inf for k in range(8)])
             for state in tip.states
         ]
         self.touches: list[tuple[float, float]] = []

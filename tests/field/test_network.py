@@ -243,7 +243,7 @@ class TestArrangements:
         whole = network(1.2, 0.05)
         pieces = [Electrode("x0", 0.05, 0.4), Electrode("x0", 0.4, 0.95), Electrode("xa", 0.05, 0.95)]
         pieces += [Electrode("y0", 0.05, 1.15), Electrode("yb", 0.05, 1.15)]
-        divided = ElectrodeNetwork.from_electrodes(1.2, 1.0, pieces, SHEET)
+        divided = ElectrodeNetwork.from_sides(1.2, 1.0, pieces, SHEET)
         fractions, together = divided.currents(0.3, 0.6), whole.currents(0.3, 0.6)
         assert fractions[0] + fractions[1] == pytest.approx(together[0], abs=1e-14)
         assert fractions[2:] == pytest.approx(together[1:], abs=1e-14)
@@ -256,7 +256,7 @@ class TestArrangements:
             for side in SIDES
             for start, stop in ((gap, cut - gap / 2), (cut + gap / 2, 1 - gap))
         ]
-        pad = ElectrodeNetwork.from_electrodes(1.0, 1.0, pieces, SHEET, (0.0, 100.0) * 4)
+        pad = ElectrodeNetwork.from_sides(1.0, 1.0, pieces, SHEET, (0.0, 100.0) * 4)
         currents = pad.currents(s, t)
         assert currents.sum() == pytest.approx(1.0)
         where = pad.locate(currents)
@@ -265,8 +265,8 @@ class TestArrangements:
 
     def test_channels_keep_the_given_order(self) -> None:
         four = [Electrode(side, 0.05, 0.95) for side in SIDES]
-        forth = ElectrodeNetwork.from_electrodes(1.0, 1.0, four, SHEET, (0, 1, 2, 3))
-        back = ElectrodeNetwork.from_electrodes(1.0, 1.0, four[::-1], SHEET, (3, 2, 1, 0))
+        forth = ElectrodeNetwork.from_sides(1.0, 1.0, four, SHEET, (0, 1, 2, 3))
+        back = ElectrodeNetwork.from_sides(1.0, 1.0, four[::-1], SHEET, (3, 2, 1, 0))
         assert back.currents(0.2, 0.4)[::-1] == pytest.approx(forth.currents(0.2, 0.4), abs=1e-15)
         assert back.conductance[::-1, ::-1] == pytest.approx(forth.conductance, abs=1e-13)
         assert forth.currents(0.2, 0.4) == pytest.approx(network(1.0, 0.05, (0, 1, 2, 3)).currents(0.2, 0.4))
@@ -281,7 +281,7 @@ class TestArrangements:
 
     def test_two_electrodes_on_opposite_sides_make_a_potentiometer(self) -> None:
         """The sides between are bare, so the potential is linear and the resistance a / b squares."""
-        pad = ElectrodeNetwork.from_electrodes(
+        pad = ElectrodeNetwork.from_sides(
             1.5, 1.0, [Electrode("x0", 0.0, 1.0), Electrode("xa", 0.0, 1.0)], SHEET
         )
         x = np.linspace(0.0, 1.5, 7)
@@ -292,7 +292,7 @@ class TestArrangements:
 
     def test_eight_pieces_locate_a_noisy_contact_better_than_four(self) -> None:
         pieces = [Electrode(side, *ends) for side in SIDES for ends in ((0.05, 0.47), (0.53, 0.95))]
-        eight = ElectrodeNetwork.from_electrodes(1.0, 1.0, pieces, SHEET)
+        eight = ElectrodeNetwork.from_sides(1.0, 1.0, pieces, SHEET)
         errors = []
         for pad in (eight, network(1.0, 0.05)):
             fit = pad.estimate(pad.currents(0.35, 0.3), 0.003)
@@ -313,7 +313,7 @@ class TestSpreading:
     def test_spreading_radius_between_bare_sides_equals_greens_function(self) -> None:
         """A strip of width pi between two electrodes: a cosine series, its logarithm summed."""
         length = 5.0
-        pad = ElectrodeNetwork.from_electrodes(
+        pad = ElectrodeNetwork.from_sides(
             length, math.pi, [Electrode("x0", 0.0, math.pi), Electrode("xa", 0.0, math.pi)], SHEET
         )
         y, n = np.array([0.1, 0.3, 1.0, 2.0]), np.arange(1, 60)[:, None]
@@ -434,7 +434,7 @@ class TestArguments:
     )
     def test_impossible_electrodes_are_rejected(self, electrodes: list[Electrode], name: str) -> None:
         with pytest.raises(ValueError, match=name):
-            ElectrodeNetwork.from_electrodes(1.0, 1.0, electrodes, SHEET)
+            ElectrodeNetwork.from_sides(1.0, 1.0, electrodes, SHEET)
 
     def test_currents_of_another_pad_are_rejected(self) -> None:
         with pytest.raises(ValueError, match="4 channels"):

@@ -33,7 +33,7 @@ def inner(surface: Surface, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
 def test_fractions_of_the_rectangle_are_those_of_the_outline_itself(kind: str) -> None:
     made = OUTLINE_TABLES[kind]
     surface = made.build()
-    rectangle = ElectrodeNetwork.from_electrodes(
+    rectangle = ElectrodeNetwork.from_sides(
         surface.a,
         surface.b,
         [Electrode(side, *surface.electrode_span(side, GAP_M, GAP_M)) for side in SIDES],

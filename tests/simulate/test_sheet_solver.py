@@ -50,7 +50,7 @@ def test_shares_and_conformal_radius_agree_with_exact_solution_on_every_surface(
     stations = surface.to_rectangle([gaps.y0[0], shape.length_m - gaps.y0[1]], 0.0)[0].tolist()
     others = surface.to_rectangle([gaps.yb[0], shape.length_m - gaps.yb[1]], 0.0)[0].tolist()
     unit = surface.b / shape.arc
-    network = ElectrodeNetwork.from_electrodes(
+    network = ElectrodeNetwork.from_sides(
         surface.a,
         surface.b,
         [

@@ -33,7 +33,6 @@ def long_pad() -> tuple[ElectrodeNetwork, HypothesisTables, Floats]:
     changed = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
     model = DiagnosisModel.from_deployment(changed, "right")
     network = model.networks[13]
-    assert isinstance(network, ElectrodeNetwork)
     tables = HypothesisTables(network, model.surfaces[13], model.parts[13](), model.electrodes[13])
     return network, tables, model.gain_covariance[13]
 

@@ -31,7 +31,7 @@ from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.tolerances import PadTolerances, part_count
 from handtouch.field.contact_law import ContactLaw
 from handtouch.field.contact_stack import stack_factor
-from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import (
     MountUncertainty,
     PadGeometry,
@@ -91,7 +91,7 @@ class PadModel:
     def __init__(
         self,
         deployment: Deployment,
-        forward_table: Callable[[RectangleNetwork], ForwardTable] = ForwardTable.from_network,
+        forward_table: Callable[[ElectrodeNetwork], ForwardTable] = ForwardTable.from_network,
     ) -> None:
         """Compute the parameters; `forward_table` returns that of a pad's network, once per distinct one."""
         entries = deployment.pads
@@ -355,7 +355,7 @@ class PadModel:
             )
         ]
 
-    def _peak_currents(self, networks: Sequence[RectangleNetwork]) -> FloatArray:
+    def _peak_currents(self, networks: Sequence[ElectrodeNetwork]) -> FloatArray:
         """Return the largest current of an electrode by the firmest contact of the deployment (n,) [A]."""
         known: dict[tuple[object, ...], float] = {}
         currents = []
@@ -370,7 +370,7 @@ class PadModel:
             currents.append(known[key])
         return np.array(currents)
 
-    def _spreading_at_centre(self, networks: Sequence[RectangleNetwork]) -> tuple[FloatArray, FloatArray]:
+    def _spreading_at_centre(self, networks: Sequence[ElectrodeNetwork]) -> tuple[FloatArray, FloatArray]:
         """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
@@ -442,9 +442,9 @@ def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
 
 
-def networks_of(deployment: Deployment) -> list[RectangleNetwork]:
+def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
     """Return the electrode network of every pad; identical pads share one object and its table."""
-    shared: dict[tuple[object, ...], RectangleNetwork] = {}
+    shared: dict[tuple[object, ...], ElectrodeNetwork] = {}
     networks = []
     for _, pad in deployment.pads:
         sheet = deployment.sheets[pad.sheet]

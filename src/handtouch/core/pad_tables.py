@@ -25,8 +25,7 @@ from handtouch.core.stages.tables import PadSurface
 from handtouch.field.contact_law import log_stack_inverse
 from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import spreading_radius
-from handtouch.field.rectangle_network import RectangleNetwork
-from handtouch.field.scheduled_network import ScheduledNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import unevenness_slopes
 
@@ -107,7 +106,7 @@ class ForwardTable:
     series_vectors: FloatArray
 
     @classmethod
-    def from_network(cls, model: RectangleNetwork) -> ForwardTable:
+    def from_network(cls, model: ElectrodeNetwork) -> ForwardTable:
         """Tabulate a pad's electrode network."""
         ends: tuple[set[float], set[float]] = {0.0, model.a}, {0.0, model.b}
         for end in model.ends:
@@ -140,7 +139,7 @@ class ForwardTable:
         """Number of electrodes."""
         return int(self.search_fractions.shape[1])
 
-    def with_dead_electrode(self, model: RectangleNetwork, electrode: int) -> ForwardTable:
+    def with_dead_electrode(self, model: ElectrodeNetwork, electrode: int) -> ForwardTable:
         """Return the table of the same pad with one electrode connected to nothing.
 
         model: the pad's network. The others collect its current in constant proportions; how these vary with
@@ -180,7 +179,7 @@ class ForwardTable:
 
 
 def _spreading_nodes(
-    model: RectangleNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+    model: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the positions at which the spreading radius is tabulated, off the edges, where it vanishes."""
     edge = _MIN_RADIUS_DISTANCE
@@ -188,7 +187,7 @@ def _spreading_nodes(
     return np.clip(x, edge * model.a, (1 - edge) * model.a), np.clip(y, edge * model.b, (1 - edge) * model.b)
 
 
-def _log_spreading(model: RectangleNetwork, x: FloatArray, y: FloatArray) -> FloatArray:
+def _log_spreading(model: ElectrodeNetwork, x: FloatArray, y: FloatArray) -> FloatArray:
     """Return ln of the spreading radius; with a floating electrode, enlarged by the resistance that it and
     the resistors add."""
     log_radius = np.log(spreading_radius(model, x, y))
@@ -272,7 +271,7 @@ class _Axis:
 
 
 def _tabulate_tolerances(
-    network: RectangleNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+    network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[NDArray[np.float32], FloatArray]:
     """Return nodes of the fields of a network's ends and of the derivatives by its aspect and by waves of its
     sheet's resistance, and the vectors of its ends.
@@ -282,11 +281,11 @@ def _tabulate_tolerances(
     s, t = np.meshgrid(_inside(nodes_x[:, 0]) / network.a, _inside(nodes_y[:, 0]) / network.b)
     nominal = network.fractions(s * network.a, t * network.b)
 
-    def slope(other: RectangleNetwork, step: float) -> FloatArray:
+    def slope(other: ElectrodeNetwork, step: float) -> FloatArray:
         """Return derivatives (n, y, x) at fixed fractions of the sides."""
         return np.asarray((other.fractions(s * other.a, t * other.b) - nominal) / step)
 
-    states = network.states if isinstance(network, ScheduledNetwork) else (tuple(range(len(nominal))),)
+    states = network.states or (tuple(range(len(nominal))),)
     ends, vectors = network.ends, np.zeros((len(network.ends), len(nominal)))
     fields = np.zeros((len(states), len(ends), *s.shape))
     for number, end in enumerate(ends):
@@ -311,7 +310,7 @@ def _tabulate_tolerances(
 
 
 def _second_derivatives(
-    network: RectangleNetwork, s: FloatArray, t: FloatArray
+    network: ElectrodeNetwork, s: FloatArray, t: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return derivatives (n, y, x) of the fractions by x x and by x y, at fractions s, t of the sides."""
     half = _PATCH_STEP * network.a

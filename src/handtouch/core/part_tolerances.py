@@ -16,8 +16,7 @@ from handtouch.config.channels import channel_states
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
-from handtouch.field.rectangle_network import RectangleNetwork
-from handtouch.field.scheduled_network import ScheduledNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand.pads import log_aspect_std, metres_per_unit, pad_surface, relative_size_stds
 
@@ -34,7 +33,7 @@ def stage_tolerances(
     pad: config.Pad,
     node: config.Node,
     sheet: config.Sheet,
-    network: RectangleNetwork,
+    network: ElectrodeNetwork,
     table: ForwardTable,
 ) -> PadTolerances:
     """Return the tolerances of a pad, gains aside; `network` and `table` are the pad's."""
@@ -73,10 +72,10 @@ def stage_tolerances(
     )
 
 
-def _state_ohm_std(network: RectangleNetwork) -> float:
+def _state_ohm_std(network: ElectrodeNetwork) -> float:
     """Return the root mean square, over the pad, of what a contact's resistance to ground differs by between
     the states of its schedule [ohm]; 0 without one."""
-    if not isinstance(network, ScheduledNetwork):
+    if not network.states:
         return 0.0
     x, y = np.meshgrid(network.a * _STATE_GRID, network.b * _STATE_GRID)
     return math.sqrt(network.state_resistance(x, y).var(axis=0).mean())

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from handtouch.design.layout import BoundaryLengths
 from handtouch.field import ConeSurface, CylinderSurface, PlaneSurface, PrismSurface, Surface
+from handtouch.field.network import perimeter_point
 from handtouch.field.outline_surface import OutlineOnSphere, OutlineSurface
-from handtouch.field.perimeter_network import perimeter_point
 
 FloatArray = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.field import PerimeterNetwork, Surface
+from handtouch.field import ElectrodeNetwork, Surface
 from handtouch.field.outline_surface import OutlineSurface
 from handtouch.hand import pad_surface
 
@@ -76,12 +76,6 @@ class BoundaryLengths:
         turns, rest = np.divmod(position_m, self.perimeter_m)
         return np.asarray(turns * self._knots[-1] + np.interp(rest, self._length, self._at))
 
-    def stretched(self, position: FloatArray, factor: float) -> FloatArray:
-        """Return positions on the perimeter of the rectangle that is `factor` times as long along x."""
-        new = np.append(0.0, np.cumsum([factor * self.a, self.b, factor * self.a, self.b]))
-        turns, rest = np.divmod(position, self._knots[-1])
-        return np.asarray(turns * new[-1] + np.interp(rest, self._knots, new))
-
 
 @dataclass(frozen=True)
 class ElectrodeLayout:
@@ -120,10 +114,10 @@ class ElectrodeLayout:
         following = np.append(self.stretches_m[1:, 0], self.stretches_m[0, 0] + boundary.perimeter_m)
         return np.asarray(following - self.stretches_m[:, 1])
 
-    def network(self, boundary: BoundaryLengths, sheet_ohm_per_square: float) -> PerimeterNetwork:
+    def network(self, boundary: BoundaryLengths, sheet_ohm_per_square: float) -> ElectrodeNetwork:
         """Return its forward model on the surface's rectangle."""
         spans = boundary.on_rectangle(self.stretches_m)
-        return PerimeterNetwork(
+        return ElectrodeNetwork.from_arcs(
             boundary.a, boundary.b, spans, sheet_ohm_per_square, tuple(self.series_ohm.tolist())
         )
 

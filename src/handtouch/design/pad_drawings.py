@@ -170,5 +170,5 @@ def _evenly_gapped_network(a: float, b: float, gap: float, like: ElectrodeNetwor
 
 def _mean_gap(network: ElectrodeNetwork) -> float:
     """Return the mean bare length at the ends of the electrodes, in the unit of the rectangle."""
-    lengths = {"x0": network.b, "xa": network.b, "y0": network.a, "yb": network.a}
-    return float(np.mean([(lengths[e.side] - (e.stop - e.start)) / 2 for e in network.electrodes]))
+    arcs = network.arcs
+    return float(2 * (network.a + network.b) - np.diff(arcs).sum()) / (2 * len(arcs))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from handtouch.design.layout import ElectrodeLayout
 from handtouch.design.pad_task import PadTask
-from handtouch.field import ContactLaw, PerimeterNetwork
+from handtouch.field import ContactLaw, ElectrodeNetwork
 
 FloatArray = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def contact_response(
 
 def _total(
     task: PadTask,
-    network: PerimeterNetwork,
+    network: ElectrodeNetwork,
     x: FloatArray,
     y: FloatArray,
     law: ContactLaw | None = None,
@@ -94,7 +94,7 @@ def _total(
 
 
 def _log_total_slopes(
-    task: PadTask, network: PerimeterNetwork, x: FloatArray, y: FloatArray, scales: FloatArray
+    task: PadTask, network: ElectrodeNetwork, x: FloatArray, y: FloatArray, scales: FloatArray
 ) -> FloatArray:
     """Return derivatives (3, k) of the logarithm of the total by u and v, and by ln F, less 1."""
     step = _POSITION_STEP * min(network.a, network.b)
@@ -104,7 +104,7 @@ def _log_total_slopes(
     return np.stack([by_x / scales[0], by_y / scales[1], np.log(more / less) / (2 * _FORCE_STEP) - 1])
 
 
-def _bends(network: PerimeterNetwork, x: FloatArray, y: FloatArray, scales: FloatArray) -> FloatArray:
+def _bends(network: ElectrodeNetwork, x: FloatArray, y: FloatArray, scales: FloatArray) -> FloatArray:
     """Return `ContactResponse.bends` (m, 2, k)."""
     step = _POSITION_STEP * min(network.a, network.b)
     ahead = network.fractions_with_jacobian(x + step, y)[1]
@@ -116,7 +116,7 @@ def _bends(network: PerimeterNetwork, x: FloatArray, y: FloatArray, scales: Floa
 def _part_columns(
     task: PadTask,
     layout: ElectrodeLayout,
-    network: PerimeterNetwork,
+    network: ElectrodeNetwork,
     fractions: FloatArray,
     total: FloatArray,
     with_force: bool,
@@ -144,8 +144,8 @@ def _part_columns(
 
 
 def _networks_with_other_parts(
-    task: PadTask, layout: ElectrodeLayout, network: PerimeterNetwork, with_force: bool
-) -> Iterator[tuple[PerimeterNetwork, float]]:
+    task: PadTask, layout: ElectrodeLayout, network: ElectrodeNetwork, with_force: bool
+) -> Iterator[tuple[ElectrodeNetwork, float]]:
     """Yield networks in which one part differs by one standard deviation, and their length along x over
     that of `network`."""
     spreads, boundary, ohm = task.tolerances, task.boundary, network.sheet_ohm_per_square
@@ -157,15 +157,10 @@ def _networks_with_other_parts(
             yield ElectrodeLayout(moved, layout.series_ohm).network(boundary, ohm), 1.0
     if spreads.log_aspect:
         factor = float(np.exp(spreads.log_aspect))
-        spans = boundary.stretched(network.spans, factor)
-        yield PerimeterNetwork(factor * network.a, network.b, spans, ohm, network.series_ohm), factor
+        yield network.stretched(factor), factor
     if spreads.resistor:
         for channel in np.flatnonzero(layout.series_ohm):
             changed = layout.series_ohm * np.exp(spreads.resistor * (np.arange(layout.count) == channel))
             yield network.with_series_ohm(changed.tolist()), 1.0
     if spreads.sheet_ohm and (with_force or layout.series_ohm.any()):
-        spans = network.spans
-        yield (
-            PerimeterNetwork(network.a, network.b, spans, ohm * (1 + spreads.sheet_ohm), network.series_ohm),
-            1.0,
-        )
+        yield layout.network(boundary, ohm * (1 + spreads.sheet_ohm)), 1.0

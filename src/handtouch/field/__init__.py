@@ -12,11 +12,9 @@ from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.outline import Outline
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
-from handtouch.field.perimeter_network import PerimeterNetwork
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.residual import PointTest, point_test, resolvable_separation
 from handtouch.field.sandwich import Sandwich, SandwichEstimate
-from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import (
     AnisotropicSurface,
     ConeSurface,
@@ -43,7 +41,6 @@ __all__ = [
     "MeshNetwork",
     "Outline",
     "OutlineNetwork",
-    "PerimeterNetwork",
     "PlaneSurface",
     "PointEstimate",
     "PointTest",
@@ -52,7 +49,6 @@ __all__ = [
     "RevolutionSurface",
     "Sandwich",
     "SandwichEstimate",
-    "ScheduledNetwork",
     "SphereSurface",
     "Surface",
     "contact_stack_resistance",

@@ -1,6 +1,6 @@
-"""Pads with real electrodes: bare corners, divided sides, series resistors to ground.
+"""Rectangular pads with electrodes on arcs of the boundary, resistors to ground and switches.
 
-Public names: `ElectrodeNetwork`, `Electrode`.
+Public names: `ElectrodeNetwork`, `Electrode`, `ElectrodeEnd`, `perimeter_point`.
 
 By reciprocity the current that a point contact sends to grounded electrode i is the potential phi_i there
 when electrode i alone is at 1 and the bare boundary insulates; `_electrodes` computes those potentials to
@@ -12,16 +12,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from handtouch.field._disc import CirclePoints, DiscMap
 from handtouch.field._electrodes import ElectrodePotentials
+from handtouch.field._series_resistors import GroundedElectrodes
+from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.rectangle import Location, Rectangle
-from handtouch.field.rectangle_network import ElectrodeEnd, RectangleNetwork
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -29,6 +31,8 @@ Side = Literal["x0", "xa", "y0", "yb"]
 
 SIDES: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
 MAX_ASPECT_RATIO = 50.0
+_RING_OF_SIDES: tuple[Side, ...] = ("y0", "xa", "yb", "x0")  # counter-clockwise from corner (0, 0)
+_CENTRE_POINTS = 64  # points of an electrode, whose mean is its centre
 _MAX_STEPS = 45
 _MAX_SETTLED_STEP = 1e-8  # step over a side; Newton's next step would be its square
 _MIN_OBSERVABLE_FRACTION = 1e-12  # with both fractions smaller, a coordinate isn't observable
@@ -46,19 +50,31 @@ class Electrode:
     stop: float
 
 
-class ElectrodeNetwork(RectangleNetwork):
-    """A resistive rectangle [0, a] x [0, b] with any electrodes on its boundary; a `ForwardModel`.
+class ElectrodeEnd(NamedTuple):
+    """End of an electrode at (x, y); `axis`: 0 where its side is along x, 1 along y."""
+
+    x: float
+    y: float
+    axis: int
+
+
+class ElectrodeNetwork(GroundedElectrodes):
+    """A resistive rectangle [0, a] x [0, b] with electrodes on arcs of its boundary; a `ForwardModel`.
 
     The usual case is four electrodes that leave `gap` bare from each corner along each side: one number, or
-    one for each side in the order x0, xa, y0, yb; 0 <= gap < half a side, in the unit of a and b.
-    `series_ohm` are the resistors from the electrodes to ground; infinity leaves one floating. Any other
-    arrangement is made by `from_electrodes`; channels are in the order of the given electrodes.
+    one for each side in the order x0, xa, y0, yb; 0 <= gap < half a side, in the unit of a and b. Other
+    arrangements are made by `from_sides` and, across corners too, by `from_arcs`; channels are in the order
+    of the given electrodes. `series_ohm` are the resistors from the electrodes to ground; infinity leaves one
+    floating. `switched` connects the electrodes in turn.
 
     Fractions are accurate to a few 1e-16 for sides within 50:1 of each other, which is the limit. Arguments
     broadcast; points off the pad or NaN give NaN.
 
     Raises ValueError naming impossible sides, gaps, resistances or arrangements.
     """
+
+    states: tuple[tuple[int, ...], ...] = ()
+    """Electrodes that are connected in each state of a schedule; empty: all of them, always."""
 
     def __init__(
         self,
@@ -74,10 +90,11 @@ class ElectrodeNetwork(RectangleNetwork):
             if not 0 <= bare < lengths[side] / 2:
                 raise ValueError(f"gap must be at least 0 and less than half of side {side}, got {bare}")
         electrodes = [Electrode(s, g, lengths[s] - g) for s, g in zip(SIDES, gaps, strict=True)]
-        self._build(a, b, electrodes, sheet_ohm_per_square, series_ohm)
+        ends, begins = _ends_on_sides(electrodes, a, b)
+        self._build(a, b, ends, begins, sheet_ohm_per_square, series_ohm)
 
     @classmethod
-    def from_electrodes(
+    def from_sides(
         cls,
         a: float,
         b: float,
@@ -85,10 +102,58 @@ class ElectrodeNetwork(RectangleNetwork):
         sheet_ohm_per_square: float,
         series_ohm: Sequence[float] | None = None,
     ) -> ElectrodeNetwork:
-        """A pad with two or more electrodes anywhere on its boundary; without resistors unless given."""
+        """A pad with two or more electrodes anywhere on its sides; without resistors unless given."""
         network = cls.__new__(cls)
-        series = (0.0,) * len(electrodes) if series_ohm is None else series_ohm
-        network._build(a, b, list(electrodes), sheet_ohm_per_square, series)
+        ends, begins = _ends_on_sides(electrodes, a, b)
+        network._build(a, b, ends, begins, sheet_ohm_per_square, series_ohm)
+        return network
+
+    @classmethod
+    def from_arcs(
+        cls,
+        a: float,
+        b: float,
+        arcs: npt.ArrayLike,
+        sheet_ohm_per_square: float,
+        series_ohm: Sequence[float] | None = None,
+    ) -> ElectrodeNetwork:
+        """A pad with electrodes on any stretches of its boundary; without resistors unless given.
+
+        arcs: begin and end of each electrode (m, 2), lengths along the boundary counter-clockwise from corner
+        (0, 0), in the unit of a and b, modulo 2 (a + b); begin < end, in the order in which they follow each
+        other, without touching.
+        """
+        network = cls.__new__(cls)
+        spans = np.array(arcs, np.float64)
+        if spans.ndim != 2 or spans.shape[1] != 2:
+            raise ValueError(f"arcs must be begin and end of each electrode, got an array {spans.shape}")
+        ring = np.append(spans.ravel(), spans[:1, 0] + 2 * (a + b))
+        if not (np.diff(ring) > 0).all():
+            raise ValueError("arcs: electrodes must follow each other around the boundary without touching")
+        ends = _ends_at(a, b, spans.ravel())
+        network._build(a, b, ends, [0] * len(spans), sheet_ohm_per_square, series_ohm)
+        return network
+
+    def switched(self, states: Sequence[Sequence[int]]) -> ElectrodeNetwork:
+        """Return the pad whose electrodes are connected in turn, each with its own resistor.
+
+        states: (states, k), the electrodes that are connected in each period, each of them in one; the others
+        float meanwhile. Fractions are those of the whole schedule: of one state they sum to 1 / states, as if
+        the same current entered in each; the true ones differ, since a contact sees other electrodes in each
+        state, which is for the estimate to allow for. What floating electrodes and resistors add to the
+        resistance between a contact and ground, in the mean of the states, is part of `spreading_radius`.
+
+        Raises ValueError for fewer than two states, and unless each electrode is in exactly one.
+        """
+        network = self.__class__.__new__(self.__class__)
+        network.__dict__.update(self.__dict__)
+        network.states = tuple(tuple(int(number) for number in state) for state in states)
+        count = len(self.series_ohm)
+        if len(network.states) < 2 or sorted(sum(network.states, ())) != list(range(count)):
+            raise ValueError(
+                f"states: each of {count} electrodes must be in one of two states or more, got {states}"
+            )
+        network._set_series_resistors(self.series_ohm)
         return network
 
     @property
@@ -102,39 +167,37 @@ class ElectrodeNetwork(RectangleNetwork):
         return self._rectangle.b
 
     @property
-    def ends(self) -> tuple[ElectrodeEnd, ...]:
-        """Low and high end of each electrode: (2 m,)."""
-        fixed = {"x0": 0.0, "xa": self.a, "y0": 0.0, "yb": self.b}
-        return tuple(
-            ElectrodeEnd(at, fixed[side], 0) if side in ("y0", "yb") else ElectrodeEnd(fixed[side], at, 1)
-            for side, start, stop in ((one.side, one.start, one.stop) for one in self.electrodes)
-            for at in (start, stop)
-        )
+    def arcs(self) -> FloatArray:
+        """Begin and end of each electrode (m, 2), begin < end, lengths along the boundary counter-clockwise
+        from corner (0, 0)."""
+        at = np.array([_position_of(self.a, self.b, end) for end in self.ends]).reshape(-1, 2)
+        begin, stop = at[np.arange(len(at)), self._begins], at[np.arange(len(at)), 1 - self._begins]
+        return np.stack([begin, np.where(stop <= begin, stop + 2 * (self.a + self.b), stop)], axis=1)
 
     @property
     def centres(self) -> FloatArray:
-        """Middle of each electrode, (m, 2)."""
-        return np.asarray(np.array([end[:2] for end in self.ends]).reshape(-1, 2, 2).mean(axis=1))
+        """Mean position of each electrode, (m, 2)."""
+        along = (np.arange(_CENTRE_POINTS) + 0.5) / _CENTRE_POINTS
+        arcs = self.arcs
+        positions = arcs[:, :1] + np.diff(arcs) * along
+        return np.asarray(perimeter_point(self.a, self.b, positions).mean(axis=-1).T)
+
+    def electrode_at(self, position: npt.ArrayLike) -> npt.NDArray[np.intp]:
+        """Return the electrode, -1 for none, at lengths (...) along the boundary as in `arcs`."""
+        begins, stops = self.arcs.T
+        beyond = np.mod(np.asarray(position, np.float64)[..., None] - begins, 2 * (self.a + self.b))
+        covers = beyond <= stops - begins
+        return np.where(covers.any(axis=-1), covers.argmax(axis=-1), -1)
 
     def with_moved_end(self, end: int, step: float) -> ElectrodeNetwork:
         """Return the pad with an end (index of `ends`) moved inward, which makes its electrode shorter."""
-        number, is_stop = divmod(end, 2)
-        old = self.electrodes[number]
-        new = replace(old, stop=old.stop - step) if is_stop else replace(old, start=old.start + step)
-        electrodes = (*self.electrodes[:number], new, *self.electrodes[number + 1 :])
-        return self.from_electrodes(self.a, self.b, electrodes, self.sheet_ohm_per_square, self.series_ohm)
+        ends = list(self.ends)
+        ends[end] = _moved(self.a, self.b, ends[end], step if end % 2 == self._begins[end // 2] else -step)
+        return self._remade(self.a, ends)
 
     def stretched(self, factor: float) -> ElectrodeNetwork:
         """Return the pad with a, and the electrodes along x, multiplied by a factor."""
-        longer = [
-            replace(electrode, start=factor * electrode.start, stop=factor * electrode.stop)
-            if electrode.side in ("y0", "yb")
-            else electrode
-            for electrode in self.electrodes
-        ]
-        return self.from_electrodes(
-            factor * self.a, self.b, longer, self.sheet_ohm_per_square, self.series_ohm
-        )
+        return self._remade(factor * self.a, [end._replace(x=factor * end.x) for end in self.ends])
 
     @property
     def conductance(self) -> FloatArray:
@@ -159,19 +222,63 @@ class ElectrodeNetwork(RectangleNetwork):
         ends.
         """
         ideal, jacobian = self._ideal_with_jacobian(self._to_disc(x, y))
-        return self._mixed(ideal), self._mixed(jacobian) / self._unit
+        return self._mixed(ideal), self._mixed(jacobian / self._unit)
+
+    def estimate(
+        self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None
+    ) -> PointEstimate:
+        """Return the maximum-likelihood contact from all noisy currents (m, ...); see
+        `handtouch.field.estimate`.
+        """
+        return estimate(self, currents, noise, start)
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return R: the sheet's resistance to a contact of radius A at (x, y) is sheet / (2 pi) ln(R / A).
 
         Electrodes at ground, in the unit of a and b, shape (...). It is the conformal radius, enlarged by the
         gaps: ln R is 2 pi times the regular part of Green's function, so it is exact for small contacts. Zero
-        at an electrode. For resistors see `series_resistance`.
+        at an electrode. For resistors see `series_resistance`; those of a schedule are included, in the mean
+        of its states.
         """
         defects = self._to_disc(x, y)
         with np.errstate(all="ignore"):
-            radius = self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects))
-            return np.asarray(radius * self._unit)
+            radius = self._disc.radius(defects) * np.exp(self._potentials.log_spread(defects)) * self._unit
+            if self.states:
+                added = self.state_resistance(x, y).mean(axis=0)
+                radius = radius * np.exp(2 * math.pi * added / self.sheet_ohm_per_square)
+            return np.asarray(radius)
+
+    def state_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return the resistance [ohm] from a contact to ground that each state of the schedule adds to that
+        of the electrodes all connected directly, (states, ...)."""
+        return np.array([one.series_resistance(x, y) for one in self._networks_of_states])
+
+    def series_resistance(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return the resistance [ohm] that resistors add between a contact and ground; 0 with a schedule,
+        where it is part of `spreading_radius`."""
+        if self.states:
+            return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
+        return super().series_resistance(x, y)
+
+    @property
+    def series_quadratic_form(self) -> FloatArray:
+        """Matrix Q (m, m) of the form f @ Q @ f [ohm] that gives `series_resistance` from measured fractions
+        f.
+
+        Raises ValueError where an electrode floats: its voltage doesn't follow from the currents.
+        """
+        return np.zeros_like(self._mix) if self.states else super().series_quadratic_form
+
+    @property
+    def series_sensitivity(self) -> FloatArray:
+        """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f of its state by
+        S[:, j] f[j]."""
+        if not self.states:
+            return super().series_sensitivity
+        found = np.zeros_like(self._mix)
+        for state, one in zip(self.states, self._networks_of_states, strict=True):
+            found[:, state] = one.series_sensitivity[:, state]
+        return found
 
     @np.errstate(all="ignore")
     def locate(self, currents: npt.ArrayLike) -> Location:
@@ -186,9 +293,12 @@ class ElectrodeNetwork(RectangleNetwork):
         converge. Raises ValueError if a side has no electrode, or an electrode floats: see `estimate`.
         """
         currents = np.asarray(currents, np.float64)
-        self._check_channels(currents)
+        if currents.shape[:1] != (count := len(self.series_ohm),):
+            raise ValueError(f"currents have shape {currents.shape}: the first axis is the {count} channels")
         if self._side_sums is None or self._unmix is None:
-            raise ValueError("locate needs a connected electrode on every side; estimate does not")
+            raise ValueError(
+                "locate needs a connected electrode on every side, none across a corner; estimate does not"
+            )
         shape = currents.shape[1:]
         flat = currents.reshape(currents.shape[0], -1)
         total = flat.sum(axis=0)
@@ -203,31 +313,80 @@ class ElectrodeNetwork(RectangleNetwork):
         self,
         a: float,
         b: float,
-        electrodes: Sequence[Electrode],
+        ends: Sequence[ElectrodeEnd],
+        begins: Sequence[int],
         sheet_ohm_per_square: float,
-        series_ohm: Sequence[float],
+        series_ohm: Sequence[float] | None,
     ) -> None:
+        """Set the pad up; `begins`: of each electrode the end, 0 or 1, where it begins counter-clockwise."""
         self._rectangle = Rectangle(a, b)
         if max(a / b, b / a) > MAX_ASPECT_RATIO:
             raise ValueError(f"a and b must be within {MAX_ASPECT_RATIO:g}:1 of each other, got {a} and {b}")
         if not (sheet_ohm_per_square > 0 and math.isfinite(sheet_ohm_per_square)):
             raise ValueError(f"sheet_ohm_per_square must be positive and finite, got {sheet_ohm_per_square}")
-        self.electrodes = tuple(electrodes)
         self.sheet_ohm_per_square = float(sheet_ohm_per_square)
-        order = _counter_clockwise(self.electrodes, a, b)
+        self.ends: tuple[ElectrodeEnd, ...] = tuple(ends)
+        """Both ends of each electrode (2 m,): low and high one on a side, begin and end of an arc."""
+        self._begins = np.array(begins, np.intp)
+        arcs = self.arcs
+        if len(arcs) < 2:
+            raise ValueError(f"electrodes: at least two are needed, got {len(arcs)}")
+        begin = [_place_on_ring(self.a, self.b, self.ends[2 * i + k]) for i, k in enumerate(self._begins)]
+        order = np.array(sorted(range(len(arcs)), key=begin.__getitem__))
         self._ring_position = np.argsort(order)
         # a power of two scales any unit to near 1, so that no product leaves the range of doubles
         self._unit = math.ldexp(1.0, math.frexp(max(self.a, self.b))[1])
         self._disc = DiscMap(self.a / self._unit, self.b / self._unit)
-        ends = (
-            np.array([_electrode_ends(self.electrodes[i], a, b) for i in order]) / self._unit
-        )  # (m, 2 ends, x and y)
-        starts = CirclePoints(self._disc, self._disc.defects(*np.roll(ends[:, 0], -1, axis=0).T))
-        stops = CirclePoints(self._disc, self._disc.defects(*ends[:, 1].T))
-        self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*ends[0].mean(axis=0)))
-        sums = np.array([[float(e.side == side) for e in self.electrodes] for side in SIDES])
-        self._side_sums = sums if sums.any(axis=1).all() else None
-        self._set_series_resistors(series_ohm, len(self.electrodes))
+        corners = np.array([end[:2] for end in self.ends]).reshape(-1, 2, 2)[order] / self._unit
+        number = np.arange(len(order))
+        first, last = (corners[number, end] for end in (self._begins[order], 1 - self._begins[order]))
+        starts = CirclePoints(self._disc, self._disc.defects(*np.roll(first, -1, axis=0).T))
+        stops = CirclePoints(self._disc, self._disc.defects(*last.T))
+        middle = perimeter_point(self.a, self.b, arcs[order[0]].mean()) / self._unit
+        self._potentials = ElectrodePotentials(stops, starts, self._disc.defects(*middle))
+        self._set_series_resistors((0.0,) * len(arcs) if series_ohm is None else series_ohm, len(arcs))
+
+    def _remade(self, a: float, ends: Sequence[ElectrodeEnd]) -> ElectrodeNetwork:
+        """Return a pad of another length, or with other ends of the same electrodes."""
+        network = self.__class__.__new__(self.__class__)
+        network.states = self.states
+        network._build(a, self.b, ends, self._begins.tolist(), self.sheet_ohm_per_square, self.series_ohm)
+        return network
+
+    def _set_series_resistors(self, series_ohm: Sequence[float], count: int | None = None) -> None:
+        """Compute the resistors' matrices; of a schedule the sum of its states'."""
+        self.__dict__.pop("_networks_of_states", None)
+        super()._set_series_resistors(series_ohm, count)
+        if self.states:
+            # a floating electrode has no current, so that each row of the sum is of one state
+            mixes = [one.currents_per_ideal for one in self._networks_of_states]
+            self._mix = np.sum(mixes, axis=0) / len(self.states)
+            self._unmix = None
+
+    @cached_property
+    def _networks_of_states(self) -> list[Self]:
+        """The same pad, always in one state, for each."""
+        found = []
+        for state in self.states:
+            one = self.__class__.__new__(self.__class__)
+            one.__dict__.update(self.__dict__)
+            one.states = ()
+            one._set_series_resistors(
+                [ohm if number in state else math.inf for number, ohm in enumerate(self.series_ohm)]
+            )
+            found.append(one)
+        return found
+
+    @cached_property
+    def _side_sums(self) -> FloatArray | None:
+        """Matrix (4, m) from the electrodes to the sides they are on; None where one is across a corner, or a
+        side without any."""
+        knots = np.cumsum([0.0, self.a, self.b, self.a, self.b])
+        begins, stops = self.arcs.T
+        low, high = knots[:-1, None], knots[1:, None]
+        on_side = ((begins >= low) & (stops <= high))[[_RING_OF_SIDES.index(side) for side in SIDES]]
+        whole = on_side.any(axis=0).all() and on_side.any(axis=1).all()
+        return on_side.astype(np.float64) if whole else None
 
     def _to_disc(self, x: npt.ArrayLike, y: npt.ArrayLike) -> ComplexArray:
         """Return defects (4, ...), NaN off the pad."""
@@ -245,11 +404,8 @@ class ElectrodeNetwork(RectangleNetwork):
         # phi = Im Phi: d/dx = Im Phi', d/dy = Im(i Phi') = Re Phi'
         return values[self._ring_position], np.stack([slope.imag, slope.real], axis=1)[self._ring_position]
 
-    def _check_channels(self, currents: FloatArray) -> None:
-        if currents.shape[:1] != (len(self.electrodes),):
-            raise ValueError(
-                f"currents have shape {currents.shape}: the first axis is the {len(self.electrodes)} channels"
-            )
+    def _mixed(self, ideal: FloatArray) -> FloatArray:
+        return np.asarray(np.tensordot(self._mix, ideal, axes=1)) if self.states else super()._mixed(ideal)
 
     def _newton(self, sums: FloatArray, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x and y (n,) where the side sums (4, n) are as measured, starting at the pad without
@@ -323,12 +479,50 @@ def _log_tangents(sides: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.log(np.tan(np.pi / 2 * sides)), np.pi / np.sin(np.pi * sides)
 
 
-def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> list[int]:
-    """Return the order of the electrodes counter-clockwise from corner (0, 0); check that they don't
-    overlap.
+def perimeter_point(a: float, b: float, position: npt.ArrayLike) -> FloatArray:
+    """Return the points (2, ...) of a rectangle's boundary at lengths along it from corner (0, 0),
+    counter-clockwise.
     """
-    if len(electrodes) < 2:
-        raise ValueError(f"electrodes: at least two are needed, got {len(electrodes)}")
+    t = np.mod(np.asarray(position, np.float64), 2 * (a + b))
+    knots = np.array([0.0, a, a + b, 2 * a + b, 2 * (a + b)])
+    return np.stack([np.interp(t, knots, [0.0, a, a, 0.0, 0.0]), np.interp(t, knots, [0.0, 0.0, b, b, 0.0])])
+
+
+def _ends_at(a: float, b: float, positions: FloatArray) -> list[ElectrodeEnd]:
+    """Return the ends of electrodes at lengths (n,) along the boundary."""
+    x, y = perimeter_point(a, b, positions)
+    axes = (np.mod(positions, a + b) >= a).astype(int)
+    return list(map(ElectrodeEnd, x.tolist(), y.tolist(), axes.tolist()))
+
+
+def _place_on_ring(a: float, b: float, end: ElectrodeEnd) -> tuple[int, float]:
+    """Return the side of an end, by number counter-clockwise from corner (0, 0), and its coordinate along it,
+    negative where the boundary runs against the axis."""
+    if end.axis == 0:
+        return (0, end.x) if end.y < b / 2 else (2, -end.x)
+    return (1, end.y) if end.x > a / 2 else (3, -end.y)
+
+
+def _position_of(a: float, b: float, end: ElectrodeEnd) -> float:
+    """Return the length along the boundary of an end."""
+    side, along = _place_on_ring(a, b, end)
+    return (along, a + along, a + b + (a + along), a + b + a + (b + along))[side]
+
+
+def _moved(a: float, b: float, end: ElectrodeEnd, step: float) -> ElectrodeEnd:
+    """Return an end moved counter-clockwise along the boundary."""
+    at, side = end[end.axis], (a, b)[end.axis]
+    at += step if _place_on_ring(a, b, end)[0] < 2 else -step
+    if not 0 <= at <= side:
+        return _ends_at(a, b, np.array([_position_of(a, b, end) + step]))[0]
+    return end._replace(y=at) if end.axis else end._replace(x=at)
+
+
+def _ends_on_sides(
+    electrodes: Sequence[Electrode], a: float, b: float
+) -> tuple[list[ElectrodeEnd], list[int]]:
+    """Return both ends of each electrode, and which one comes first counter-clockwise; raise ValueError where
+    they overlap."""
     for electrode in electrodes:
         if electrode.side not in SIDES:
             raise ValueError(f"side must be one of {', '.join(SIDES)}, got {electrode.side!r}")
@@ -340,21 +534,10 @@ def _counter_clockwise(electrodes: Sequence[Electrode], a: float, b: float) -> l
         for one, other in itertools.pairwise(pieces):
             if other.start < one.stop:
                 raise ValueError(f"electrodes overlap: {one} and {other}")
-    side_order: tuple[Side, ...] = ("y0", "xa", "yb", "x0")
-
-    def place(i: int) -> tuple[int, float]:
-        side = electrodes[i].side
-        return side_order.index(side), electrodes[i].start if side in ("y0", "xa") else -electrodes[i].start
-
-    return sorted(range(len(electrodes)), key=place)
-
-
-def _electrode_ends(electrode: Electrode, a: float, b: float) -> list[tuple[float, float]]:
-    """Return the two ends of an electrode, counter-clockwise."""
-    start, stop = electrode.start, electrode.stop
-    return {
-        "y0": [(start, 0.0), (stop, 0.0)],
-        "xa": [(a, start), (a, stop)],
-        "yb": [(stop, b), (start, b)],
-        "x0": [(0.0, stop), (0.0, start)],
-    }[electrode.side]
+    fixed = {"x0": 0.0, "xa": float(a), "y0": 0.0, "yb": float(b)}
+    ends = [
+        ElectrodeEnd(at, fixed[side], 0) if side in ("y0", "yb") else ElectrodeEnd(fixed[side], at, 1)
+        for side, start, stop in ((one.side, one.start, one.stop) for one in electrodes)
+        for at in (start, stop)
+    ]
+    return ends, [int(one.side in ("x0", "yb")) for one in electrodes]

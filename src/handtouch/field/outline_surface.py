@@ -145,7 +145,7 @@ class OutlineSurface(Surface):
         return start, stop
 
     def perimeter_positions(self, ends_m: npt.ArrayLike) -> FloatArray:
-        """Return electrodes on arcs (m, 2) of the outline [m] as `PerimeterNetwork` takes them.
+        """Return electrodes on arcs (m, 2) of the outline [m] as `ElectrodeNetwork.from_arcs` takes them.
 
         Begin and end of each, counter-clockwise; positions on the outline are modulo its length.
         """

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.network import ElectrodeNetwork
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ UNEVEN_WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 _TERMS, _QUADRATURE_POINTS = 24, 64  # along each side
 
 
-def unevenness_slopes(network: RectangleNetwork, x: ArrayLike, y: ArrayLike) -> FloatArray:
+def unevenness_slopes(network: ElectrodeNetwork, x: ArrayLike, y: ArrayLike) -> FloatArray:
     """Return derivatives (waves, channels, ...) of the fractions at x, y by the amplitude of each wave."""
     number = np.arange(1, _TERMS + 1)[:, None] * math.pi
     s, t = np.broadcast_arrays(np.asarray(x) / network.a, np.asarray(y) / network.b)
@@ -39,7 +39,7 @@ class UnevenSheet:
     wave: index of `UNEVEN_WAVES`. amplitude: of the logarithm of the sheet resistance.
     """
 
-    def __init__(self, network: RectangleNetwork, wave: int, amplitude: float) -> None:
+    def __init__(self, network: ElectrodeNetwork, wave: int, amplitude: float) -> None:
         self._network, self._wave, self._amplitude = network, wave, amplitude
 
     @property
@@ -59,7 +59,7 @@ class UnevenSheet:
 
 
 @lru_cache(maxsize=64)
-def _sine_coefficients(network: RectangleNetwork) -> FloatArray:
+def _sine_coefficients(network: ElectrodeNetwork) -> FloatArray:
     """Return coefficients (waves, channels, terms, terms) of sin(m pi x / a) sin(n pi y / b)."""
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     at, weights = (nodes + 1) / 2, weights / 2

@@ -16,9 +16,6 @@ from handtouch import config
 from handtouch.field.model import FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.outline_surface import OutlineSurface
-from handtouch.field.perimeter_network import PerimeterNetwork
-from handtouch.field.rectangle_network import RectangleNetwork
-from handtouch.field.scheduled_network import ScheduledNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
@@ -61,7 +58,7 @@ def network_parameters(pad: config.Pad) -> tuple[object, ...]:
     return pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
 
 
-def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
+def pad_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
     """Return the pad's electrodes on its rectangle, whether on its sides or on arcs of its outline, and with
     their schedule if they are switched."""
     if not pad.arcs_mm:
@@ -71,8 +68,8 @@ def pad_network(pad: config.Pad, sheet: config.Sheet) -> RectangleNetwork:
         raise ValueError("electrode_arcs_mm: only pads with an outline have arcs")
     ends_m = _M_PER_MM * (np.array(pad.arcs_mm) + np.array(pad.gaps_mm) * (1.0, -1.0))
     spans = surface.perimeter_positions(ends_m)
-    network = PerimeterNetwork(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
-    return ScheduledNetwork(network, pad.state_numbers) if pad.switch_states else network
+    network = ElectrodeNetwork.from_arcs(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
+    return network.switched(pad.state_numbers) if pad.switch_states else network
 
 
 def electrode_network(
@@ -95,13 +92,13 @@ def electrode_network(
         factor = stretch if side in ("y0", "yb") else 1.0
         start, stop = surface.electrode_span(side, low_m, high_m)
         electrodes.append(Electrode(side, factor * start, factor * stop))
-    return ElectrodeNetwork.from_electrodes(
+    return ElectrodeNetwork.from_sides(
         stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )
 
 
 def models_with_other_parts(
-    nominal: RectangleNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
+    nominal: ElectrodeNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
 ) -> tuple[FractionModel, ...]:
     """Return models in each of which one part of the pad differs by one standard deviation; gains aside.
 
@@ -135,7 +132,7 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
     return (*(sheet.gap_std_mm,) * (2 * count), log_aspect_std(pad, sheet), *waves, *resistors)
 
 
-def metres_per_unit(pad: config.Pad, network: RectangleNetwork) -> NDArray[np.float64]:
+def metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> NDArray[np.float64]:
     """Return the length on the surface of a unit of the rectangle, along each electrode at each end, (2 c,).
 
     `network`: the pad's.

@@ -31,7 +31,7 @@ from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.field.model import FractionModel
-from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_stds
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
@@ -114,7 +114,7 @@ class SupervisorWorker:
     ) -> None:
         deployment = start.deployment
         entries = deployment.pads
-        models: dict[object, tuple[RectangleNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
+        models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
         self._pads = []
         noise = start.noise_counts[:, None] * start.ampere_per_count
         for number, (hand, pad) in enumerate(entries):

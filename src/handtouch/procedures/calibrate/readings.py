@@ -14,7 +14,7 @@ import numpy as np
 
 from handtouch import config
 from handtouch.field import Surface
-from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import pad_network, pad_surface
 from handtouch.host.units import GRAM_FORCE_N
 
@@ -94,7 +94,7 @@ class PadCircuitModel:
         self.pad = pad
         self.node, self.sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
         self._surface: Surface = pad_surface(pad)
-        self._network: RectangleNetwork = pad_network(pad, self.sheet)
+        self._network: ElectrodeNetwork = pad_network(pad, self.sheet)
 
     def circuit_at(self, position_m: tuple[float, float], std_m: float = 0.0) -> ContactCircuit:
         """Return the circuit at arc lengths (x, y) from x0 and y0; std_m: standard deviation of the

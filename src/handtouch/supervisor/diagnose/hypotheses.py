@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.rectangle_network import RectangleNetwork
 from handtouch.field.surface import Surface
 from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
@@ -103,7 +102,7 @@ class HypothesisTables:
 
     def __init__(
         self,
-        network: RectangleNetwork,
+        network: ElectrodeNetwork,
         surface: Surface,
         parts: Sequence[FractionModel] = (),
         electrodes: tuple[str, ...] = SIDE_ELECTRODES,
@@ -119,7 +118,7 @@ class HypothesisTables:
         nominal = network.fractions(x, y).T
         series = np.array(network.series_ohm)
         orders, factors = [np.arange(c)], [np.ones(c)]
-        for order in _swap_permutations(network, c):
+        for order in _swap_permutations(electrodes):
             names = tuple(electrodes[k] for k in np.flatnonzero(order != np.arange(c)))
             self.hypotheses.append(Hypothesis(FaultKind.SWAPPED_CABLES, names))
             orders.append(order)
@@ -143,7 +142,7 @@ class HypothesisTables:
                 )
                 others.append(merged)
         self._electrode_faults = _FractionTable(np.stack(others), shape)
-        torn = self._torn_pads(network, surface, nominal) if isinstance(network, ElectrodeNetwork) else []
+        torn = self._torn_pads(network, surface, nominal) if electrodes == SIDE_ELECTRODES else []
         self._torn = _FractionTable(np.reshape(torn, (len(torn), *nominal.shape)), shape)
         self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
@@ -409,13 +408,14 @@ def _solve_within(gram: FloatArray, gradient: FloatArray, reach: float | FloatAr
     return np.asarray(step)
 
 
-def _swap_permutations(network: RectangleNetwork, channels: int) -> list[NDArray[np.intp]]:
+def _swap_permutations(electrodes: tuple[str, ...]) -> list[NDArray[np.intp]]:
     """Return swaps of two cables, except those that mirror a pad of four; and, of four sides, both pairs."""
-    opposite = {(0, 1), (2, 3)} if isinstance(network, ElectrodeNetwork) else {(0, 2), (1, 3)}
+    by_sides, channels = electrodes == SIDE_ELECTRODES, len(electrodes)
+    opposite = {(0, 1), (2, 3)} if by_sides else {(0, 2), (1, 3)}
     found = []
     for pair in itertools.combinations(range(channels), 2):
         if channels > 4 or pair not in opposite:
             order = np.arange(channels)
             order[list(pair)] = pair[::-1]
             found.append(order)
-    return [*found, np.array([2, 3, 0, 1])] if isinstance(network, ElectrodeNetwork) else found
+    return [*found, np.array([2, 3, 0, 1])] if by_sides else found

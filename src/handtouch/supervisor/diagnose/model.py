@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.field.model import FractionModel
-from handtouch.field.rectangle_network import RectangleNetwork
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand import models_with_other_parts, pad_network, pad_surface
 from handtouch.wire.diagnosis import Diagnosis
@@ -78,7 +78,7 @@ class DiagnosisModel:
 
     links: tuple[str, ...]
     electrodes: Sequence[tuple[str, ...]]
-    networks: Sequence[RectangleNetwork]
+    networks: Sequence[ElectrodeNetwork]
     surfaces: Sequence[Surface]
     sheets: Sequence[config.Sheet]
     parts: Sequence[Callable[[], Sequence[FractionModel]]]
@@ -110,7 +110,7 @@ class DiagnosisModel:
                 factor = node.channel_scale[pad.electrodes.index(name)]
                 scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
                 limits[row, k] = channel.saturation
-        by_design: dict[Hashable, RectangleNetwork] = {}  # pads of one design share one network
+        by_design: dict[Hashable, ElectrodeNetwork] = {}  # pads of one design share one network
         networks, designs = [], []
         for pad, node in zip(pads, nodes, strict=True):
             sheet = deployment.sheets[pad.sheet]

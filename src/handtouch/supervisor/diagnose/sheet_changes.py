@@ -114,9 +114,9 @@ def _is_cut_off(x: FloatArray, y: FloatArray, cut: tuple[tuple[int, int], float,
 
 def _electrode_of_nodes(network: ElectrodeNetwork, x: FloatArray, y: FloatArray) -> NDArray[np.intp]:
     """Return the index of the electrode at each node, -1 for none."""
+    a, b = network.a, network.b
     owner = np.full(x.shape, -1)
-    for number, electrode in enumerate(network.electrodes):
-        along, length = (y, network.b) if electrode.side in ("x0", "xa") else (x, network.a)
-        on_side = {"x0": x == 0, "xa": x == 1, "y0": y == 0, "yb": y == 1}[electrode.side]
-        owner[on_side & (along * length >= electrode.start) & (along * length <= electrode.stop)] = number
+    sides = ((y == 0, a * x), (x == 1, a + b * y), (y == 1, 2 * a + b - a * x), (x == 0, 2 * (a + b) - b * y))
+    for on_side, position in sides:
+        owner[on_side] = np.maximum(owner[on_side], network.electrode_at(position[on_side]))
     return owner
