@@ -45,8 +45,8 @@ _MIN_AGE_S = dict(zip(_CAUSES, (8.0, 15.0, 8.0, 6.0, 15.0, 15.0), strict=True))
 # foreseen) and changed where episodes of benchmarks/diagnose_episodes.py with seeds below 1100 were named
 # wrongly. docs/benchmarks/diagnose.md measures the result on other seeds.
 #
-# With half or double the odds of any row or prior, or of the evidence of presses, other pads and age below, 17
-# to 19 of 22 faults (gum, moisture, offsets, tails; 19 as it is) are named rightly in the world `default`,
+# With half or double the odds of any row or prior, or of the evidence of presses, other pads and age below,
+# 17 to 19 of 22 faults (gum, moisture, offsets, tails; 19 as it is) are named rightly in the world `default`,
 # tuning family, after 15 to 20 s in the median (18 s); none of them, nor of 11 uses without a fault, wrongly.
 _LOG_PRIOR = np.log([0.969, 0.008, 0.012, 0.005, 0.003, 0.003])
 """Causes of a load that lasts for seconds: an object in 97 of 100."""
