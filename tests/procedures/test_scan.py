@@ -518,6 +518,20 @@ def test_node_that_cannot_store_its_id_is_reported(wire: VirtualBus) -> None:
     assert "can't store its node id" in report.problems[0]
 
 
+def test_node_that_leaves_before_it_gets_an_id_is_reported(wire: VirtualBus) -> None:
+    _, made = unconfigured(wire, [5, 6])
+
+    def unplug(progress: str) -> None:
+        if "for serial 5" in progress:
+            made[0].unplug()
+
+    request = ScanRequest(lss=True, first_assigned_id=9, listen_s=0.05)
+    (report,) = scan_buses([wire.bus], request, progress=unplug)
+    assert [address.serial for address in report.assigned] == [6]
+    (problem,) = report.problems
+    assert "serial 5: no response" in problem
+
+
 def test_exhausted_node_ids_are_reported(wire: VirtualBus) -> None:
     unconfigured(wire, [5, 6])
     (report,) = scan_buses([wire.bus], ScanRequest(lss=True, first_assigned_id=127, listen_s=0.05))
