@@ -55,8 +55,8 @@ class Durations:
             self._measured.setdefault(report.nodeid, [0.0, 0.0])[report.when != "setup"] += report.duration
 
     def pytest_sessionfinish(self) -> None:
-        """Write, but for xdist's workers, whose reports all reach their controller."""
-        if self._measured and "PYTEST_XDIST_WORKER" not in os.environ:
+        """Write, but for xdist's workers, whose reports reach their controller, and beside it in vcan-run."""
+        if self._measured and not {"PYTEST_XDIST_WORKER", "VCAN_RUN"} & os.environ.keys():
             rounded = {test: [round(part_s, 3) for part_s in both] for test, both in self._measured.items()}
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.write_text(json.dumps(self._read() | rounded, indent=0))
