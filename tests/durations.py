@@ -59,7 +59,9 @@ class Durations:
         if self._measured and not {"PYTEST_XDIST_WORKER", "VCAN_RUN"} & os.environ.keys():
             rounded = {test: [round(part_s, 3) for part_s in both] for test, both in self._measured.items()}
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._path.write_text(json.dumps(self._read() | rounded, indent=0))
+            part = self._path.with_suffix(f".{os.getpid()}")
+            part.write_text(json.dumps(self._read() | rounded, indent=0))
+            part.replace(self._path)  # whole at any time
 
     def _expected(self, test: str) -> list[float]:
         processes = "end_to_end" in test or test.count("/") == 1
