@@ -23,8 +23,9 @@ from typing import IO, Any
 import numpy as np
 
 from benchmarks.bench_latency import descriptors, in_own_network, on_loopback, resident_mb
+from benchmarks.client_checks import Truth, longest_age_s, watch_hand, watch_ros
 from benchmarks.compressed_days import Act
-from benchmarks.page import progress
+from benchmarks.page import ROOT, progress
 from handtouch.client import connect, request
 from handtouch.config import load
 
@@ -57,8 +58,8 @@ class Processes:
         """Start one that doesn't run."""
         path = self.folder / f"{name}.err"
         output = path.open("a")
-        command = [sys.executable, "-m", "handtouch", *self.commands[name]]
-        self.running[name] = subprocess.Popen(command, stdout=output, stderr=output, text=True)
+        command = [sys.executable, "-m", *self.commands[name]]
+        self.running[name] = subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=output, text=True)
         output.close()
         self._files.setdefault(name, (path, path.open(), 0))
 
@@ -121,29 +122,37 @@ def run_cycles(minutes: float, folder: Path, fill: Callable[[bool], None]) -> di
     serials = [pad.serial or 0 for _, pad in deployment.pads]
     cycles = max(3, round(60 * minutes / CYCLE_S) - 1)
     text, acts = scenario_text(links, serials, cycles)
-    (folder / "scenario.toml").write_text(text)
     complete, control = (f"ipc://{folder}/{name}" for name in ("complete", "control"))
     page = free_port()
+    scenario, started = folder / "scenario.toml", folder / "started"
     processes = Processes(
         {
-            "nodes": ["simulate", str(path), "--scenario", str(folder / "scenario.toml"), "--world", "ideal"],
-            "daemon": ["run", str(path)],
+            "nodes": ["benchmarks.client_checks", str(path), str(scenario), str(started)],
+            "daemon": ["handtouch", "run", str(path)],
             "recorder": [
-                "record", str(path), "-o", str(folder / "recordings"), "--percepts", "--rotate-mb", "4",
-                "--keep-free-mb", "8",
+                "handtouch", "record", str(path), "-o", str(folder / "recordings"), "--percepts",
+                "--rotate-mb", "4", "--keep-free-mb", "8",
             ],
-            "view": ["view", "--endpoint", f"ipc://{folder}/live", "--port", str(page)],
-            "bridge": ["bridge", "zenoh", str(path), "--listen", f"tcp/127.0.0.1:{free_port()}"],
+            "view": ["handtouch", "view", "--endpoint", f"ipc://{folder}/live", "--port", str(page)],
+            "bridge": [
+                "handtouch", "bridge", "zenoh", str(path), "--listen", f"tcp/127.0.0.1:{free_port()}",
+            ],
         },
         folder,
     )  # fmt: skip
+    scenario.write_text(text)
+    truth = Truth.of_process(scenario, started)
     for name in processes.commands:
         processes.start(name)
     rows: list[dict[str, Any]] = []
     memory: list[tuple[float, dict[str, tuple[float, int]]]] = []
     troubles: list[Act] = []
     begin_s = time.monotonic()
-    with connect("hand/*", "percept/*/*", endpoint=complete) as reader:
+    with (
+        connect("hand/*", "percept/*/*", endpoint=complete) as reader,
+        watch_hand(f"ipc://{folder}/live", control, truth, longest_age_s(deployment)) as checked,
+        watch_ros(complete, truth) as checked_ros,
+    ):
         served = wait_served(control, len(links), processes)
         while reader.recv(0) is not None:
             pass  # what waited meanwhile
@@ -151,7 +160,7 @@ def run_cycles(minutes: float, folder: Path, fill: Callable[[bool], None]) -> di
         for cycle in range(cycles):
             kind = "disk full" if cycle in (cycles // 3, 2 * cycles // 3) else TROUBLES[cycle % len(TROUBLES)]
             at_s = time.monotonic()
-            trouble(kind, processes, control, fill)
+            trouble(kind, processes, control, fill, truth)
             troubles.append(Act(kind, at_s, time.monotonic()))
             late_ms: list[float] = []
             freed = False
@@ -199,13 +208,17 @@ def run_cycles(minutes: float, folder: Path, fill: Callable[[bool], None]) -> di
         "supervisor": status["service"]["supervisor"],
         "pads": Counter(pad["calibration_state"] for pad in status["pads"]),
         "store_bytes": sum(file.stat().st_size for file in folder.glob("calibrations.db*")),
+        "checked": [found.figures() for found in (checked.finish(), checked_ros.found)],
+        "contradictions": [*checked.found.texts, *checked_ros.found.texts],
         "log": [(at - start_s, name, line) for at, name, line in processes.lines],
         "acts": [a._asdict() for a in acts]
         + [t._replace(from_s=t.from_s - start_s, until_s=t.until_s - start_s)._asdict() for t in troubles],
     }
 
 
-def trouble(kind: str, processes: Processes, control: str, fill: Callable[[bool], None]) -> None:
+def trouble(
+    kind: str, processes: Processes, control: str, fill: Callable[[bool], None], truth: Truth
+) -> None:
     """Cause a trouble."""
     name, _, what = kind.partition(" ")
     if kind == "disk full":
@@ -221,6 +234,8 @@ def trouble(kind: str, processes: Processes, control: str, fill: Callable[[bool]
         processes.running["nodes"].send_signal(signal.SIGCONT)
     else:
         processes.stop(name, signal.SIGKILL if what == "killed" else signal.SIGTERM)
+        if name == "daemon":
+            truth.deaths_ns.append(time.monotonic_ns())
         processes.start(name)
 
 

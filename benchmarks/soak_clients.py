@@ -24,8 +24,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bench_latency import PORT, descriptors, in_own_network, machine, on_loopback, resident_mb
+from benchmarks.client_checks import CHECKED, Truth, longest_age_s, watch_hand, watch_ros
+from benchmarks.cycled_processes import scenario_text
 from benchmarks.hostile_clients import HOSTILE, burner, cpu_seconds, hostile_client
-from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.page import ROOT, made_by, options, output_folder, progress, table
 from handtouch.client import connect, request
 from handtouch.config import load
 
@@ -176,12 +178,21 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
     """Run the daemon with simulated nodes, and both phases."""
     settings = load(config).daemon
     endpoints = {name: getattr(settings, name) for name in ("live", "complete", "control", "inputs")}
-    command = [sys.executable, "-m", "handtouch"]
-    nodes = subprocess.Popen([*command, "simulate", str(config)], stdout=subprocess.DEVNULL)
-    daemon = subprocess.Popen([*command, "run", str(config)], stderr=subprocess.DEVNULL)
+    deployment = load(config)
+    scenario, started = config.with_name("scenario.toml"), config.with_name("started")
+    scenario.write_text(scenario_text([pad.link for _, pad in deployment.pads], [], 0)[0])
+    truth = Truth.of_process(scenario, started)
+    command = [sys.executable, "-m"]
+    played = [*command, "benchmarks.client_checks", str(config), str(scenario), str(started)]
+    nodes = subprocess.Popen(played, cwd=ROOT)
+    daemon = subprocess.Popen([*command, "handtouch", "run", str(config)], stderr=subprocess.DEVNULL)
+    checked = ExitStack()
     try:
         with connect("hand/*", endpoint=endpoints["live"]) as hands:
             hands.recv()
+        limit_s = longest_age_s(deployment)
+        hand = checked.enter_context(watch_hand(endpoints["live"], endpoints["control"], truth, limit_s))
+        ros = checked.enter_context(watch_ros(endpoints["complete"], truth))
         time.sleep(JOINING_S)
         kinds = [kind for kind, (count, _) in HOSTILE.items() for _ in range(count)]
         hostile = phase(
@@ -194,7 +205,9 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
         left = {"memory_mb": resident_mb(daemon.pid), "descriptors": descriptors(daemon.pid)}
         burners = [(run_burner, (share,)) for share in hostile["shares"]]
         control = phase(endpoints, [daemon.pid, nodes.pid], seconds, burners)
+        found = [hand.finish(), ros.found]
     finally:
+        checked.close()
         for process in (daemon, nodes):
             process.terminate()
             process.wait()
@@ -202,7 +215,15 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
         kind: sum(share for k, share in zip(kinds, hostile["shares"], strict=True) if k == kind)
         for kind in HOSTILE
     }
-    return {"seconds": seconds, "hostile": hostile, "control": control, "left": left, "used": used}
+    return {
+        "seconds": seconds,
+        "hostile": hostile,
+        "control": control,
+        "left": left,
+        "used": used,
+        "checked": [part.figures() for part in found],
+        "contradictions": [text for part in found for text in part.texts],
+    }
 
 
 def verdicts(results: dict[str, Any]) -> dict[str, tuple[float, bool]]:
@@ -215,6 +236,7 @@ def verdicts(results: dict[str, Any]) -> dict[str, tuple[float, bool]]:
         "tick rate, beside hostile clients / beside burners": (rate, rate >= 1 / MAX_RATIO),
         "p99, beside hostile clients / beside burners": (tail, tail <= MAX_RATIO),
         "memory, last two thirds, MB": (growth, growth <= MAX_GROWTH_MB),
+        "contradictions of the truth": (wrong := len(results["contradictions"]), wrong == 0),
     }
 
 
@@ -260,6 +282,7 @@ Latency is from SYNC to the message in the subscriber.
 {chr(10).join(judged)}
 
 Rejected meanwhile: {rejected}; {results["hostile"]["congestion_episodes"]} congestion episodes.
+{chr(10).join(table("What clients showed", CHECKED, results["checked"]))}
 {LEAVING_S:.0f} s after the hostile clients left: {results["left"]["memory_mb"]:.0f} MB,
 {results["left"]["descriptors"]} descriptors.
 

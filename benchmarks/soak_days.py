@@ -22,13 +22,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.page import made_by, options, output_folder, progress, table
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small
 
 import matplotlib
 
 from benchmarks.bench_latency import machine
+from benchmarks.client_checks import CHECKED
 from benchmarks.compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, is_work, run_days
 from benchmarks.cycled_processes import growth, in_own_network, run_cycles, unexplained
 from benchmarks.reloaded_days import RELOAD_PERIOD_S, compare_reloads
@@ -172,6 +173,7 @@ def problems(found: dict[str, Any]) -> list[str]:
             wrong.append("not all pads became operational")
         if cycles["rows"][-1]["lost"]:
             wrong.append(f"the subscriber lost {cycles['rows'][-1]['lost']} messages")
+        wrong += cycles["contradictions"]
         wrong += [
             f"unexplained at {at:.0f} s: {name}: {line[:200]}" for at, name, line in cycles["unexplained"]
         ]
@@ -314,6 +316,7 @@ def page(found: dict[str, Any]) -> list[str]:
             f"{cycles['supervisor']['restarts']} times in the last session; log messages without a cause: "
             f"{len(cycles['unexplained'])}.", "",
         ]  # fmt: skip
+        text += table("What clients showed", CHECKED, cycles["checked"])
     if reloads := found.get("reloads"):
         text += [
             f"## {reloads['hours']:g} hours with reloads", "", f"{reloads['made']}.", "",

@@ -25,17 +25,28 @@ from typing import Any
 
 import zmq
 
+from benchmarks.client_checks import HandCheck, Truth
 from benchmarks.page import made_by, options, output_folder, progress, table
 from handtouch import wire
+from handtouch.client.daemon_clock import MIN_AGE_LIMIT_S
 from handtouch.client.hand import Hand
-from tests.client.hand_messages import make_frame, make_service
+from handtouch.simulate.scenario import Scenario
+from tests.client.hand_messages import LINKS, make_frame, make_service
 
 PERIOD_S = 0.005
 TURNS, QUICK_TURNS = 100, 3
 COMPUTE_S = 0.5
 POLL_S = 0.0005
-READING_S = 0.002
-"""Between judging a frame and the checker's look at the clock, on a loaded host"""
+HELD = "repeat = true" + "".join(
+    f"""
+[[touch]]
+link = "{link}"
+from_s = 0
+duration_s = 600
+path = [[0.5, 0.5]]
+force_n = [1.0]"""
+    for link in LINKS
+)
 
 
 def publish(port: int) -> None:
@@ -81,27 +92,16 @@ class Publisher:
         self._process.wait()
 
 
-class Checker:
-    """Reads a hand, and compares every frame with the time: `worst_s` is the oldest that it returned."""
+class Reader(HandCheck):
+    """Reads a hand that is always touched, and checks every frame."""
 
     def __init__(self, hand: Hand) -> None:
-        self.hand, self.worst_s, self.frames, self.violations = hand, 0.0, 0, 0
-
-    def read(self) -> bool:
-        """Return True if the hand has a frame."""
-        arrays = self.hand.latest()
-        if arrays is None:
-            return False
-        age_s = 1e-9 * (time.monotonic_ns() - arrays.t_ns)
-        self.frames += 1
-        self.worst_s = max(self.worst_s, age_s)
-        self.violations += age_s > self.hand.max_age_s + READING_S
-        return True
+        super().__init__(hand, Truth(Scenario.parse(HELD), lambda: 1), MIN_AGE_LIMIT_S)
 
     def wait_until(self, is_known: bool) -> float:
         """Read until there is a frame, or none; return the time that took [s]."""
         begin_s = time.monotonic()
-        while self.read() != is_known:
+        while self.look() != is_known:
             time.sleep(POLL_S)
         return time.monotonic() - begin_s
 
@@ -110,17 +110,17 @@ class Checker:
         self.wait_until(True)
         end_s = time.monotonic() + 0.1
         while time.monotonic() < end_s:
-            self.read()
+            self.look()
             time.sleep(POLL_S)
 
 
 @contextmanager
-def running() -> Iterator[tuple[Publisher, Checker]]:
+def running() -> Iterator[tuple[Publisher, Reader]]:
     """Start a publisher and a client of it."""
     publisher = Publisher()
     try:
         with Hand("right", endpoint=publisher.endpoint) as hand:
-            yield publisher, Checker(hand)
+            yield publisher, Reader(hand)
     finally:
         publisher.kill()
 
@@ -128,40 +128,42 @@ def running() -> Iterator[tuple[Publisher, Checker]]:
 def measure(turns: int) -> tuple[list[dict[str, Any]], int]:
     """Return a row of times [ms] for each event, and the number of frames that were too old."""
 
-    def kill(publisher: Publisher, checker: Checker) -> float:
+    def kill(publisher: Publisher, reader: Reader) -> float:
         begin_s = time.monotonic()
         publisher.signal(signal.SIGKILL)
-        checker.wait_until(False)
+        reader.wait_until(False)
         passed_s = time.monotonic() - begin_s
         publisher.kill()
+        reader.truth.deaths_ns.append(time.monotonic_ns())
         publisher.start()
         return passed_s
 
-    def hang(publisher: Publisher, checker: Checker) -> float:
+    def hang(publisher: Publisher, reader: Reader) -> float:
         publisher.signal(signal.SIGSTOP)
-        passed_s = checker.wait_until(False)
+        passed_s = reader.wait_until(False)
         publisher.signal(signal.SIGCONT)
         return passed_s
 
-    def hang_while_computing(publisher: Publisher, checker: Checker) -> float:
+    def hang_while_computing(publisher: Publisher, reader: Reader) -> float:
         time.sleep(0.1)  # frames wait
         publisher.signal(signal.SIGSTOP)
         time.sleep(COMPUTE_S)
-        passed_s = checker.wait_until(False)
+        passed_s = reader.wait_until(False)
         publisher.signal(signal.SIGCONT)
         return passed_s
 
-    def compute(_: Publisher, checker: Checker) -> float:
+    def compute(_: Publisher, reader: Reader) -> float:
         time.sleep(COMPUTE_S)
-        return checker.wait_until(True)
+        return reader.wait_until(True)
 
-    def restart(publisher: Publisher, checker: Checker) -> float:
+    def restart(publisher: Publisher, reader: Reader) -> float:
         publisher.kill()
+        reader.truth.deaths_ns.append(time.monotonic_ns())
         publisher.start()
-        checker.wait_until(False)
-        return checker.wait_until(True)
+        reader.wait_until(False)
+        return reader.wait_until(True)
 
-    events: dict[str, Callable[[Publisher, Checker], float]] = {
+    events: dict[str, Callable[[Publisher, Reader], float]] = {
         "killed, until nothing is returned": kill,
         "hangs or cable pulled, until nothing is returned": hang,
         "hangs while the client computes, until nothing is returned": hang_while_computing,
@@ -170,22 +172,22 @@ def measure(turns: int) -> tuple[list[dict[str, Any]], int]:
     }
     rows, violations = [], 0
     for name, event in events.items():
-        with running() as (publisher, checker):
+        with running() as (publisher, reader):
             times_s = []
             for _ in range(turns):
-                checker.settle()
-                times_s.append(event(publisher, checker))
+                reader.settle()
+                times_s.append(event(publisher, reader))
             rows.append(
                 {
                     "event": name,
                     "median, ms": 1e3 * statistics.median(times_s),
                     f"worst of {turns}, ms": 1e3 * max(times_s),
-                    "frames checked": checker.frames,
-                    "oldest frame returned, ms": 1e3 * checker.worst_s,
-                    "too old": checker.violations,
+                    "frames checked": reader.found.checked["reads"],
+                    "oldest frame returned, ms": 1e3 * reader.worst_age_s,
+                    "contradictions": len(reader.finish().texts),
                 }
             )
-            violations += checker.violations
+            violations += len(reader.found.texts)
             progress(rows[-1])
     return rows, violations
 

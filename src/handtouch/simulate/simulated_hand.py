@@ -49,6 +49,12 @@ class ScenarioClock:
                 self._start_ns = sync_ns
             return (sync_ns - self._start_ns) * 1e-9
 
+    @property
+    def start_ns(self) -> int | None:
+        """Time of the start; None before it."""
+        with self._lock:
+            return self._start_ns
+
     def elapsed_s(self, now_ns: int) -> float:
         """Return the time since the start, 0 before it."""
         with self._lock:
@@ -133,6 +139,11 @@ class SimulatedHand:
         for bus in self._buses:
             bus.nodes.stop()
         self._resources.close()
+
+    @property
+    def start_ns(self) -> int | None:
+        """Time of the first SYNC, at which the stimulus began; None before it."""
+        return self._clock.start_ns
 
     @property
     def truth(self) -> list[GroundTruth]:
