@@ -1,6 +1,6 @@
 """Selection of pads by patterns such as "thumb_*", in a time that is linear in the pattern's length.
 
-Public names: `PadNames`, `PadName`.
+Public names: `PadNames`, `PadName`, `PATTERNS_PER_PAD`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from handtouch.config.problems import suggest_name
 
 PadName = tuple[str, str]
 """hand, link"""
+PATTERNS_PER_PAD = 2
+"""Most patterns of one request, for each pad of the deployment"""
 
 
 class PadNames:
@@ -38,7 +40,8 @@ class PadNames:
         self._link_starts = _places(
             start + len(hand) + 1 for start, (hand, _) in zip(starts, names, strict=True)
         )
-        self._inside = (1 << ends[-1]) - 1 ^ reduce(or_, self._ends) if ends else 0
+        self._all_ends = reduce(or_, self._ends, 0)
+        self._inside = (1 << sum(len(name) + 1 for name in self._full)) - 1 ^ self._all_ends
         text = "".join(f"{name}\0" for name in self._full)
         self._alphabet = sorted(set("".join(self._full)))
         self._holding = {
@@ -52,10 +55,13 @@ class PadNames:
         """Return the pads (n,) named by patterns of links, or of "hand/link" with a slash.
 
         `*` matches any text, `?` any character, `[a-f]` one of a set, `[!a-f]` none of it, as fnmatch does.
-        Raises ValueError for a pattern that matches none.
+        Raises ValueError for a pattern that matches none, among the first of so many that further ones can't
+        add a pad.
         """
         chosen = 0
-        for pattern in patterns:
+        for number, pattern in enumerate(patterns):
+            if number >= PATTERNS_PER_PAD * len(self.names) and chosen == self._all_ends:
+                break
             matched = self._match(pattern)
             if not matched:
                 known = self._full if "/" in pattern else [link for _, link in self.names]

@@ -20,8 +20,6 @@ from handtouch.wire import PERCEPT_KINDS
 
 FILE_OWNER, CONTROL_OWNER = "the deployment file", "control"
 MAX_CLIENTS = 32
-PATTERNS_PER_PAD = 2
-"""Most patterns of one request, for each pad of the deployment"""
 MAX_CLIENT_CHARACTERS = 32_768
 """Length of the patterns of all clients' scenes together, which every answer contains"""
 BoolArray = NDArray[np.bool_]

@@ -22,8 +22,9 @@ from handtouch.config import Deployment, Table
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import RequestedOutput, SceneRequest
 from handtouch.core.events import BaselineEvent, EvidenceEvent
+from handtouch.core.pad_patterns import PATTERNS_PER_PAD
 from handtouch.core.pipeline import Pipeline
-from handtouch.core.scene import PATTERNS_PER_PAD, Demand
+from handtouch.core.scene import Demand
 from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
     Command,
