@@ -11,14 +11,16 @@ hand, and writes the time of the first SYNC into FILE.
 from __future__ import annotations
 
 import argparse
+import asyncio
 import math
 import struct
 import sys
 import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from itertools import cycle
 from pathlib import Path
 from typing import Any, cast
@@ -54,6 +56,9 @@ STARVED_NS = 10_000_000
 """Between two looks of a reader, which then had no processor: nobody else's delay counts"""
 NEAR_NS = 2_000_000_000
 """Between the death of a daemon and the end of a loop because of it"""
+PERIODS = 3
+LATE_NS = 150_000_000
+"""Between a sample and its message, beyond which nodes without processor time may have sampled later, too"""
 MAX_KEPT = 50
 POLL_S = 0.002
 STEP_NS = 10_000_000
@@ -135,7 +140,11 @@ class Found:
 
 
 class HandCheck:
-    """Compares what a `Hand` shows with the truth; `max_age_s`: the stated limit of a frame's age."""
+    """Compares what a `Hand` shows with the truth.
+
+    `max_age_s`: stated limit of a frame's age; three of the intervals of frames, where they are longer, as those
+    of a daemon are that has too little processor time.
+    """
 
     def __init__(self, hand: Hand, truth: Truth, max_age_s: float, name: str = "Hand") -> None:
         self.hand, self.truth, self.found = hand, truth, Found(name)
@@ -146,6 +155,7 @@ class HandCheck:
         self._next_link = cycle(truth.links)
         self._checked: HandArrays | None = None
         self._violating: HandArrays | None = None
+        self._intervals_ns = deque[int](maxlen=3)  # of the newest frames that were shown
 
     def look(self) -> bool:
         """Read the newest frame and check it; return True if there is one."""
@@ -167,6 +177,8 @@ class HandCheck:
         self._check_time(arrays, before_ns)
         if arrays is self._checked:
             return
+        if self._checked is not None and (passed := arrays.frame.seq - self._checked.frame.seq) > 0:
+            self._intervals_ns.append((arrays.t_ns - self._checked.t_ns) // passed)
         self._checked = arrays
         self.found.checked["frames"] += 1
         touched, sample_ns = self.hand.touched, arrays.sample_ns
@@ -179,11 +191,12 @@ class HandCheck:
     def _check_time(self, arrays: HandArrays, before_ns: int) -> None:
         age_ns = before_ns - arrays.t_ns
         self.worst_age_s = max(self.worst_age_s, 1e-9 * age_ns)
+        limit_ns = max(self._max_age_ns, PERIODS * max(self._intervals_ns, default=0))
         died_ns = max(self.truth.deaths_ns, default=0)
         if arrays is self._violating:
             return
         violations = self.found.violations.total()
-        if age_ns > self._max_age_ns:
+        if age_ns > limit_ns:
             self.found.add("age", f"a frame of {1e-6 * age_ns:.1f} ms is shown")
         if arrays.t_ns > time.monotonic_ns() or min(self.hand.age_s.array) < 0:
             self.found.add("age", "a frame or a sample of the future is shown")
@@ -215,17 +228,13 @@ class HandCheck:
         if shown and force_n == 0:
             self.found.add("unknown", f"{link} is touched, its sum of forces is 0 N")
 
-    def read_loop(self, stop: threading.Event) -> None:
-        """Read with `latest` within a `for` until `stop`, with another loop after the end of one."""
-        while not stop.wait(POLL_S):
-            if not self.look():
-                continue
+    async def read_loops(self) -> None:
+        """Read with `latest` within `async for`, with another loop after the end of one, until cancelled."""
+        while True:
             try:
-                for _ in self.hand:
-                    while not stop.is_set() and self.look():
-                        time.sleep(POLL_S)
-                    if stop.is_set():
-                        return
+                async for _ in self.hand:
+                    while self.look():
+                        await asyncio.sleep(POLL_S)
             except ConnectionError:
                 end_ns = time.monotonic_ns()
                 self._ends_ns.append((end_ns, self._is_starved(end_ns)))
@@ -247,15 +256,23 @@ class HandCheck:
 def watch_hand(endpoint: str, control: str, truth: Truth, max_age_s: float) -> Iterator[HandCheck]:
     """Check what a `Hand` shows, in a thread, meanwhile."""
     stop = threading.Event()
-    with Hand("right", endpoint=endpoint, control=control) as hand:
+    with Hand("right", endpoint=endpoint, control=control) as hand, ThreadPoolExecutor(1) as threads:
         check = HandCheck(hand, truth, max_age_s)
-        thread = threading.Thread(target=check.read_loop, args=(stop,), name="checked hand")
-        thread.start()
+        done = threads.submit(asyncio.run, _until(stop, check.read_loops()))
         try:
             yield check
         finally:
             stop.set()
-            thread.join()
+            done.result()
+
+
+async def _until(stop: threading.Event, reading: Coroutine[Any, Any, None]) -> None:
+    task = asyncio.ensure_future(reading)
+    while not (stop.is_set() or task.done()):
+        await asyncio.sleep(0.1)
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
 
 
 class RosCheck:
@@ -266,7 +283,7 @@ class RosCheck:
     def __init__(self, truth: Truth) -> None:
         self.truth, self.found = truth, Found("ROS 2 relay")
         self.stamper = Stamper()
-        self._unknown: set[str] = set()
+        self._unknown_ns: dict[str, int] = {}
 
     def writer(self, name: str, *_: object) -> _Writer:
         """Return a topic's writer."""
@@ -277,12 +294,12 @@ class RosCheck:
         self.found.checked["wrenches"] += 1
         if math.isnan(wrench[0]):
             self.found.checked["unknown"] += 1
-            if link in self._unknown:
-                self.found.add("unknown", f"{link}: a second wrench of NaN")
-            self._unknown.add(link)
+            if self._unknown_ns.get(link, 0) >= t_ns:
+                self.found.add("unknown", f"{link}: a second wrench of NaN without another sample")
+            self._unknown_ns[link] = t_ns
             return
-        self._unknown.discard(link)
-        true = self.truth.is_touched(link, t_ns)
+        self._unknown_ns.pop(link, None)
+        true = self.truth.is_touched(link, t_ns) if now_ns - t_ns < LATE_NS else None
         self.found.checked["touches compared"] += true is not None
         if true and not any(wrench):
             self.found.add("touch", f"{link} is touched at {t_ns}, its wrench is 0 N")

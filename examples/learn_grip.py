@@ -22,6 +22,7 @@ from scipy.stats.qmc import Halton
 
 from handtouch.simulate.tactile.grip_environment import (
     EPISODE_STEPS,
+    FEATURES,
     MAX_RATE_N_S,
     PERIOD_S,
     GripEnvironments,
@@ -38,6 +39,8 @@ MEAN, STD = np.array([2.5, 1.0, 0.0]), np.array([1.5, 0.5, 0.02])
 """First distribution of the policies: constant [N], gain of the distance [N/mm] and of the speed [N s/mm]."""
 MIN_STD = 0.1 * STD
 WEIGHT_M_S2 = 9.81
+TOUCH = FEATURES["observation.touch"]["names"]
+COLUMNS = [TOUCH.index("thumb_tip.x_m"), TOUCH.index("thumb_tip.position_known")]
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,9 @@ def run(grips: GripEnvironments, policies: FloatArray, objects: tuple[FloatArray
     begin_mm = np.full(grips.num_envs, np.nan)
     before_mm = np.zeros(grips.num_envs)
     for _ in range(EPISODE_STEPS):
-        touched, x_m = observation["observation.touch"][:, :2].T.astype(np.float64)
-        begin_mm = np.where(np.isnan(begin_mm) & (touched > 0), 1e3 * x_m, begin_mm)
-        slid_mm = np.where(touched > 0, 1e3 * x_m - begin_mm, before_mm)
+        x_m, known = observation["observation.touch"][:, COLUMNS].T.astype(np.float64)
+        begin_mm = np.where(np.isnan(begin_mm) & (known > 0), 1e3 * x_m, begin_mm)
+        slid_mm = np.where(known > 0, 1e3 * x_m - begin_mm, before_mm)
         speed_mm_s, before_mm = (slid_mm - before_mm) / PERIOD_S, slid_mm
         features = np.stack([np.ones(grips.num_envs), slid_mm, speed_mm_s])
         target_n = np.einsum("nk,kn->n", policies, features)

@@ -182,9 +182,10 @@ def test_wrenches_that_contradict_the_truth_are_found(
     check = RosCheck(truth)
     check.stamper.wall_offset_ns = 1_700_000_000_000_000_123
     writer = check.writer(f"right/{link[0]}/wrench")
+    now_ns = time.monotonic_ns()
     for number, force_n in enumerate(newtons):
         name = link[number % len(link)]
-        writer.write(encode_plain_wrench(time.monotonic_ns(), name, force_n, check.stamper))
+        writer.write(encode_plain_wrench(now_ns, name, force_n, check.stamper))
     assert [words in text for text in check.found.texts] == [True] * bool(words)
     assert check.found.checked["wrenches"] == len(newtons)
 

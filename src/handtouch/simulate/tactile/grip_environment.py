@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config import shipped
 from handtouch.simulate.tactile.sensor import TactileReading, TactileSensor
+from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -62,7 +63,9 @@ _SCENE = """
 </mujoco>
 """  # the thumb's plate faces +x, the index finger's tip closes along -x, gravity acts along -z
 
-_TOUCH = ("touched", "x_m", "y_m", "force_n", "force_std_n")
+_TOUCH = (
+    "touched", "x_m", "y_m", "force_n", "force_std_n", "sampled", "position_known", "force_known",
+)  # fmt: skip
 FEATURES: Mapping[str, Mapping[str, Any]] = {
     "observation.state": {"dtype": "float32", "shape": (2,), "names": ["grip_force_n", "finger_m"]},
     "observation.touch": {
@@ -147,10 +150,14 @@ class _Grips:
 
 
 def _touch(reading: TactileReading) -> NDArray[np.float32]:
-    """Return touched, position and force of each pad (count, pads x 5); 0 for what isn't known."""
-    position_m = reading.position_m
-    columns = [reading.touched, position_m[..., 0], position_m[..., 1], reading.force_n, reading.force_std_n]
-    return np.nan_to_num(np.stack(columns, axis=-1, dtype=np.float32)).reshape(len(position_m), -1)
+    """Return the values of `_TOUCH` of each pad (count, pads x 8); what isn't known is 0 and said to be."""
+    x_m, y_m = reading.position_m[..., 0], reading.position_m[..., 1]
+    force_n, std_n = reading.force_n, reading.force_std_n
+    clear, touched = reading.state == PadState.CLEAR, reading.state == PadState.TOUCHED
+    force_known = clear | touched & np.isfinite(force_n) & np.isfinite(std_n)
+    flags = [clear | touched, touched & np.isfinite(x_m), force_known]
+    columns = np.stack([touched, x_m, y_m, force_n, std_n, *flags], axis=-1, dtype=np.float32)
+    return np.nan_to_num(columns).reshape(len(x_m), -1)
 
 
 def _observation_space() -> gymnasium.Space[Any]:
