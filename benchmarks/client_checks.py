@@ -142,8 +142,8 @@ class Found:
 class HandCheck:
     """Compares what a `Hand` shows with the truth.
 
-    `max_age_s`: stated limit of a frame's age; three of the intervals of frames, where they are longer, as those
-    of a daemon are that has too little processor time.
+    `max_age_s`: stated limit of a frame's age; three of the intervals of frames where those are longer, as of
+    a daemon that has too little processor time.
     """
 
     def __init__(self, hand: Hand, truth: Truth, max_age_s: float, name: str = "Hand") -> None:
