@@ -18,6 +18,7 @@ import pytest
 
 from handtouch.cli import main
 from handtouch.client import connect, keys, request
+from handtouch.config import shipped
 from handtouch.record.recording import Recording
 from tests.starter import Starter
 
@@ -231,3 +232,23 @@ def test_a_support_archive_has_status_and_recording_and_no_secret(reachable: Rea
 
 def key_files(reachable: Reachable) -> list[Path]:
     return [reachable.keys / "server.key", reachable.key("reader"), reachable.key("pilot")]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["view", "--host", "0.0.0.0"],
+        ["view", "--host", "192.168.1.7", "--foxglove"],
+        ["view", "--host", "::"],
+        ["simulate", str(shipped.path("two_finger.toml")), "--gripper", "tcp://*:5590"],
+        ["simulate", str(shipped.path("two_finger.toml")), "--gripper", "tcp://0.0.0.0:5590"],
+    ],
+    ids=" ".join,
+)
+def test_programs_without_keys_refuse_public_addresses(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*command, "--seconds", "1"])
+    error = capsys.readouterr().err
+    assert "is reachable from other machines" in error
+    assert error.count("\n") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import socket
 import struct
 import subprocess
 import sys
@@ -244,6 +245,39 @@ def test_a_client_of_foxglove_receives_scene_frames_log_and_values(
     assert received[LOG_TOPIC]["message"].startswith("contact ")
     assert received["contact/h/plane"]["link"] == "plane"
     assert all(entity["frame_id"] in ("plane", "round") for entity in received[SCENE_TOPIC]["entities"])
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_allowed"),
+    [
+        (None, True),
+        ("https://app.foxglove.dev", True),
+        ("file://", True),
+        ("http://localhost:8080", True),
+        ("http://127.0.0.1:8080", True),
+        ("http://[::1]:8080", True),
+        ("http://evil.example", False),
+        ("https://app.foxglove.dev.evil.example", False),
+        ("http://app.foxglove.dev", False),
+        ("http://localhost.evil.example", False),
+        ("http://127.0.0.1.evil.example", False),
+        ("null", False),
+        ("", False),
+        ("http://[", False),
+    ],
+)
+def test_pages_of_other_websites_may_not_read_the_hand(origin: str | None, is_allowed: bool) -> None:
+    with live.FoxgloveServer("127.0.0.1", 0) as server:
+        host, port = server.url.removeprefix("ws://").split(":")
+        lines = [
+            *("GET / HTTP/1.1", f"Host: {host}:{port}", "Connection: Upgrade", "Upgrade: websocket"),
+            *("Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="),
+            *("Sec-WebSocket-Protocol: foxglove.sdk.v1", *([f"oRiGiN: {origin}"] * (origin is not None))),
+        ]
+        with socket.create_connection((host, int(port)), timeout=60) as client:
+            client.sendall("\r\n".join([*lines, "", ""]).encode())
+            status = client.makefile("rb").readline().split()[1]
+    assert status == (b"101" if is_allowed else b"403")
 
 
 def test_a_port_in_use_and_a_missing_package_are_reported_with_a_remedy(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import webbrowser
 
 from handtouch.cli.options import add_endpoint, add_percepts, integer, positive_number
 from handtouch.client import connect
+from handtouch.host.endpoints import is_loopback
 from handtouch.host.installation import extra_command
 from handtouch.host.signals import stop_on_signals
 from handtouch.view import page
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_endpoint(parser, "live")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address that the page is served at (default: 127.0.0.1)"
+        "--host", default="127.0.0.1", help="loopback address that it is served at (default: 127.0.0.1)"
     )
     parser.add_argument(
         "--port",
@@ -56,9 +57,16 @@ def run(
 ) -> int:
     """Serve the page, or Foxglove, until Ctrl-C, or for `seconds`; `show` opens it in this machine's browser.
 
-    Exit status 0, 1 when the daemon rejects this client, 2 for an unusable endpoint, key or port, or without
-    the extra.
+    Exit status 0, 1 when the daemon rejects this client, 2 for an unusable endpoint, key, host or port, or
+    without the extra.
     """
+    if not is_loopback(host):
+        print(
+            f"--host {host}: is reachable from other machines, and HTTP has no keys; leave it out, and open "
+            "an SSH tunnel on the other machine: ssh -L 5588:localhost:5588 ROBOT",
+            file=sys.stderr,
+        )
+        return 2
     stop = stop_on_signals()
     if foxglove:
         return _serve_foxglove(endpoint, key, host, port, show, seconds, percepts, stop)

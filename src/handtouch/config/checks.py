@@ -27,6 +27,7 @@ from handtouch.config.tables import (
 from handtouch.config.units import pad_unit_problems, unit_problems
 from handtouch.field.outline import MIN_CLEARANCE
 from handtouch.field.outline_surface import OutlineSurface
+from handtouch.host.endpoints import is_loopback
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
@@ -143,7 +144,7 @@ def endpoint_problem(endpoint: str, keys: bool) -> str:
         return f"needs a port: tcp://{address}:5580, or :* for any free one"
     if port != "*" and not (port.isascii() and port.isdigit() and 1 <= int(port[:6]) <= 65535):
         return "must end in a port, 1 to 65535, or * for any free one"
-    if not keys and not _is_loopback(host):
+    if not keys and not _is_ipv4_loopback(host):
         return (
             "is reachable from other machines, which requires CURVE keys: create them beside this file with "
             '`handtouch keys make FOLDER` and set keys = "FOLDER" in [daemon], or use loopback (127.0.0.1)'
@@ -157,7 +158,7 @@ def _metrics_problem(address: str) -> str:
     host, _, port = address.rpartition(":")
     if not host or not (port.isascii() and port.isdigit() and int(port[:6]) <= 65535):
         return "must be HOST:PORT such as 127.0.0.1:9580"
-    if not _is_loopback(host):
+    if not _is_ipv4_loopback(host):
         return (
             "is reachable from other machines, and CURVE keys don't protect HTTP; use "
             f"127.0.0.1:{port}, and a TLS proxy or an SSH tunnel for other machines"
@@ -165,13 +166,8 @@ def _metrics_problem(address: str) -> str:
     return ""
 
 
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.IPv4Address(host).is_loopback  # the sockets use IPv4 only
-    except ValueError:
-        return False
+def _is_ipv4_loopback(host: str) -> bool:
+    return ":" not in host and is_loopback(host)  # the sockets use IPv4 only
 
 
 def _check_buses(buses: Iterable[Bus]) -> Iterator[Problem]:

@@ -1,6 +1,7 @@
-"""ZeroMQ endpoints: defaults of the daemon and the simulated gripper, `to_connect` for bound ones, and
-`check_ipc_path` for those to bind."""
+"""ZeroMQ endpoints: defaults of the daemon and the simulated gripper, `to_connect` for bound ones;
+`check_ipc_path` and `is_loopback` for those to bind."""
 
+import ipaddress
 import os
 import socket
 import stat
@@ -34,6 +35,14 @@ def check_ipc_path(endpoint: str) -> None:
     with socket.socket(socket.AF_UNIX) as probe:
         if probe.connect_ex(str(path)) == 0:
             raise OSError("another daemon is using it; stop that one, or set another endpoint")
+
+
+def is_loopback(host: str) -> bool:
+    """Return True for an address of this machine that no other one can reach, and for localhost."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def to_connect(bound: str) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import msgpack
 import zmq
 
-from handtouch.host.endpoints import check_ipc_path
+from handtouch.host.endpoints import check_ipc_path, is_loopback
 from handtouch.simulate.gripper import GripperWorld
 
 _POLL_MS = 100
@@ -33,7 +33,16 @@ class GripperService:
         self._thread: threading.Thread | None = None
 
     def open(self) -> None:
-        """Bind the endpoint and start the thread. Raises ValueError if the endpoint can't be bound."""
+        """Bind the endpoint and start the thread.
+
+        Raises ValueError if the endpoint can't be bound, or is reachable from other machines.
+        """
+        transport, _, address = self._endpoint.partition("://")
+        if transport == "tcp" and not is_loopback(address.rpartition(":")[0].strip("[]")):
+            raise ValueError(
+                f"{self._endpoint}: is reachable from other machines, and the gripper has no keys; use "
+                f"tcp://127.0.0.1:{address.rpartition(':')[2]}"
+            )
         socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.MAXMSGSIZE, _MAX_REQUEST_BYTES)

@@ -5,9 +5,11 @@ Public names: `FoxgloveServer`, `serve`, `PATTERNS`. Needs the extra `foxglove`.
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from typing import Any, Self
+from urllib.parse import quote
 
 import foxglove
 
@@ -15,6 +17,7 @@ from handtouch.client import Subscriber
 from handtouch.record.foxglove import FoxgloveConverter
 from handtouch.record.recorder import MessageRecorder, RotationLimits
 from handtouch.record.schemas import MessageFormat, wire_format
+from handtouch.view.origin_gate import OriginGate
 
 PORT = 8765
 """The port that Foxglove proposes."""
@@ -26,7 +29,8 @@ _POLL_S = 0.2
 class FoxgloveServer:
     """A WebSocket server for Foxglove, whose channels begin with their first message; a `MessageFile`.
 
-    A client that doesn't keep up loses the oldest messages. Raises RuntimeError if the address can't be used.
+    A client that doesn't keep up loses the oldest messages. Pages of other websites are refused. Raises
+    RuntimeError if the address can't be used.
     """
 
     size = 0
@@ -34,14 +38,21 @@ class FoxgloveServer:
     def __init__(self, host: str, port: int) -> None:
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        self._server = foxglove.start_server(name="handtouch", host=host, port=port, context=self._context)
-        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
-        self.app_url = self._server.app_url() or ""
+        inner = _hidden_address()
+        self._server = foxglove.start_server(name="handtouch", host=inner, port=0, context=self._context)
+        try:
+            self._gate = OriginGate(host, port, (inner, self._server.port))
+        except RuntimeError:
+            self._server.stop()
+            raise
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._gate.port}"
+        self.app_url = f"https://app.foxglove.dev?ds=foxglove-websocket&ds.url={quote(self.url, safe='')}"
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._gate.__exit__()
         self._server.stop()
 
     def write(
@@ -68,6 +79,11 @@ class FoxgloveServer:
 
     def finish(self, summary: dict[str, str]) -> None:
         """Do nothing: the server stops at the end of its context."""
+
+
+def _hidden_address() -> str:
+    """Return a loopback address for Foxglove's own server, which checks no Origin: a page can't guess it."""
+    return ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
 
 
 def serve(messages: Subscriber[Any], server: FoxgloveServer, stop: threading.Event, end_s: float) -> None:
