@@ -313,6 +313,23 @@ def test_doubtful_mount_is_reported_and_its_hand_keeps_palm_and_base(tmp_path: P
     assert RobotModels(deployment).hands == ["right"]
 
 
+@pytest.mark.parametrize(
+    "mount",
+    [
+        "{ position_mm = [26.0, 0.0, 2.5] }",
+        "{ position_mm = [26.0, 3.0, 32.5] }",
+        "{ position_mm = [26.0, 0.0, 12.5], rpy_deg = [180.0, 0.0, 0.0] }",
+        "{ position_mm = [20.0, 25.0, -4.0], rpy_deg = [30.0, 20.0, 10.0] }",
+    ],
+)
+def test_the_proposed_mount_is_on_the_body_and_faces_outward(tmp_path: Path, mount: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        check_urdfs(changed(tmp_path, (MOUNT, f"mount = {mount}")), "hand.toml")
+    found = re.search(r"nearest place is (position_mm = \[.*?\]), (rpy_deg = \[.*?\])", str(raised.value))
+    assert found is not None
+    check_urdfs(changed(tmp_path, (MOUNT, f"mount = {{ {found[1]}, {found[2]} }}")), "hand.toml")
+
+
 def test_pad_may_lie_on_the_visible_surface_or_on_the_collision_body(tmp_path: Path) -> None:
     text = shipped.path("utah_mit.urdf").read_text()
     (mounted,) = re.findall(r'<link name="index_distal">.*?</link>', text, flags=re.DOTALL)

@@ -41,6 +41,11 @@ _KEYS_REQUIRING_URDF = (
     *("palm_link", "base_link", "joint_names", "joint_prefix"),
     *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
 )
+_GRADIENT_STEP_M = 1e-5
+_MAX_SURFACE_STEPS = 50
+_MIN_SLOPE = 0.1
+"""A distance has slope 1, but where two places are equally near"""
+_MAX_PARALLEL = 0.9
 INSTALL_COMMAND = extra_command("urdf")
 
 
@@ -232,20 +237,52 @@ def _mount_problems(
         yield Problem(
             f"{at}mount.position_mm",
             _value_text(pad.mount.position_mm),
-            f"the pad's centre is {-height * 1e3:.1f} mm inside {body}; move it to the surface",
+            f"the pad's centre is {-height * 1e3:.1f} mm inside {body}; move it to the surface"
+            + _nearest_mount(rotation, middle, shapes, folder),
         )
     elif height > _MAX_PAD_HEIGHT_M:
         yield Problem(
             f"{at}mount.position_mm",
             _value_text(pad.mount.position_mm),
-            f"the pad's centre is {height * 1e3:.1f} mm from {body}; is it on another link, or in metres?",
+            f"the pad's centre is {height * 1e3:.1f} mm from {body}; is it on another link, or in metres?"
+            + _nearest_mount(rotation, middle, shapes, folder),
         )
     elif outward_height <= height:
         yield Problem(
             f"{at}mount.rpy_deg",
             _value_text(pad.mount.rpy_deg),
-            f"the pad faces into {body}; its z axis points outward",
+            f"the pad faces into {body}; its z axis points outward"
+            + _nearest_mount(rotation, middle, shapes, folder),
         )
+
+
+def _nearest_mount(
+    rotation: FloatArray, middle_m: FloatArray, shapes: Sequence[urdf.BodyShape], folder: Path
+) -> str:
+    """Return the mount at the nearest place on the body, as a hint; empty if none is found.
+
+    Its z axis is the body's outward normal there, its x axis as near as possible to the given one.
+    """
+    point = np.array(middle_m, np.float64)
+    for _ in range(_MAX_SURFACE_STEPS):
+        steps = _GRADIENT_STEP_M * np.vstack([np.zeros(3), np.eye(3), -np.eye(3)])
+        distance_m = signed_distance_m(shapes, point + steps, folder)
+        gradient = (distance_m[1:4] - distance_m[4:]) / (2 * _GRADIENT_STEP_M)
+        if not (slope := float(np.linalg.norm(gradient))) > _MIN_SLOPE:
+            return ""  # on an edge inside the body
+        if abs(distance_m[0]) < _GRADIENT_STEP_M:
+            break
+        point -= distance_m[0] * gradient / slope**2
+    else:
+        return ""
+    z = gradient / slope
+    x = next(axis for axis in rotation.T if abs(axis @ z) < _MAX_PARALLEL)
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    y = np.cross(z, x)
+    rpy = np.arctan2(y[2], z[2]), -np.arcsin(np.clip(x[2], -1, 1)), np.arctan2(x[1], x[0])
+    position_mm = (1e3 * point).round(1).tolist()
+    return f"; the nearest place is position_mm = {position_mm}, rpy_deg = {np.rad2deg(rpy).round().tolist()}"
 
 
 def _no_such(what: str, name: str, known: Sequence[str]) -> str:
