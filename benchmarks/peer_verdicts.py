@@ -87,7 +87,7 @@ class Verdicts:
         self.left[act] += left
         if act == "down" and (new == "absent" or old == "absent") and "bus can" in reason:
             return
-        if new in ACCUSED or (act not in ("nmt", "down") and (left or new == "stale")):
+        if new in ACCUSED or (act not in ("nmt", "gateway", "down") and (left or new == "stale")):
             self.record(act, f"{node}: {old} -> {new}: {reason}", was_starved and COMMON_CAUSE.search(reason))
 
     def record(self, act: str, what: str, excused: object) -> None:

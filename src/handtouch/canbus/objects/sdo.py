@@ -70,14 +70,16 @@ class ObjectTransport(Protocol):
 
 
 class _SdoNetwork:
-    """The part of a canopen network that its SDO client uses; `command` is that of the latest request."""
+    """The part of a canopen network that its SDO client uses; `command` is that of the latest request
+    that isn't an abort."""
 
     def __init__(self, send: Callable[[int, bytes], bool]) -> None:
         self._send = send
         self.command = 0
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:  # noqa: ARG002
-        self.command = data[0] & _COMMAND_MASK
+        command = data[0] & _COMMAND_MASK
+        self.command = self.command if command == _ABORT else command
         self._send(can_id, bytes(data))
 
 
