@@ -132,3 +132,18 @@ def test_heartbeat_slowed_by_another_client_is_repaired_once_the_node_answers(ma
     assert rig.node(1).read_object(0x1017, 0) == 100
     assert [rig.state(n) for n in (1, 2)] == [NodeState.OPERATIONAL] * 2
     assert rig.status(1).reason == ""
+
+
+def test_nodes_that_boot_together_with_one_cob_id_are_both_faulted_and_neither_is_stale(
+    make_rig: Make,
+) -> None:
+    rig = make_rig(3)
+    rig.node(2).write_object(0x1801, 1, 0x281, keep=True)
+    rig.plug_all()
+    rig.start()
+    events = rig.run(3000)
+    assert NodeState.STALE not in {event.new_state for event in events}
+    for number, other in ((1, 2), (2, 1)):
+        assert rig.state(number) is NodeState.FAULTED
+        assert f"COB-ID 0x281 of its samples is also that of pad{other}" in rig.status(number).reason
+    assert rig.state(3) is NodeState.OPERATIONAL

@@ -518,7 +518,8 @@ class Master:
                     f"COB-ID 0x{cob_id:X} of its samples is also that of {two.spec.name}; "
                     "give one of them another COB-ID and store it"
                 )
-                if one is node or one.lifecycle.state in STARTED:  # others read their own again
+                state = one.lifecycle.state
+                if one is node or state in (*STARTED, NodeState.CONFIGURING):  # others read theirs again
                     self._advance(one, IdentifierClash(reason), now_ns)
         if others:
             return True
