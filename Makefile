@@ -171,5 +171,18 @@ deb: ## build the Debian package of the services in build/, for this machine's P
 	git archive --prefix=handtouch/ HEAD | tar -x -C build/deb
 	cd build/deb/handtouch && PATH=/usr/sbin:/usr/bin:/sbin:/bin dpkg-buildpackage -us -uc -b
 
+.PHONY: release
+release: ## check and build all parts of a release in dist/, and print the commands that upload them
+	@test -z "$$(git status --porcelain)" || { echo "commit your changes first: a release is made of a commit"; exit 1; }
+	@$(MAKE) --no-print-directory check docs dist
+	@npm pack --silent --pack-destination dist ./clients/js
+	@if command -v dpkg-buildpackage >/dev/null; then $(MAKE) --no-print-directory deb && cp build/deb/*.deb dist/; \
+	else echo "no Debian package: apt-get install debhelper dpkg-dev"; fi
+	@version=$$(sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml); ls -l dist; printf '%s\n' "To publish $$version:" \
+		"  git tag -s v$$version && git push origin v$$version" \
+		"  python -m twine upload dist/*.whl dist/*.tar.gz" \
+		"  npm publish dist/handtouch-$$version.tgz" \
+		"  docker build -f docker/Dockerfile -t handtouch:$$version . && docker push REGISTRY/handtouch:$$version"
+
 clean: ## remove build results and .venv
 	rm -rf $(VENV) dist build .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis
