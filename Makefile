@@ -158,6 +158,7 @@ schema: $(VENV)/.run ## write config/*.schema.json from the models of the deploy
 
 # for any Linux with glibc 2.17 or later on these machines; ziglang has a C compiler for both
 dist: $(VENV)/.dev ## build the source archive, wheels for x86_64 and aarch64, and a bill of materials (SBOM)
+	$(BIN)/python -m benchmarks.stale
 	@$(LOCKED) -r locks/dist.lock
 	rm -rf dist build
 	$(BIN)/python -m build --no-isolation --sdist

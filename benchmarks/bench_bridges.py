@@ -1,9 +1,11 @@
 """Bridges to ROS 2 and Zenoh: latency, losses and processor time, with simulated publishers.
 
 A process publishes the messages of hands of 15 pads, as their daemons would. The real bridge relays them: to
-ROS 2, with all pads touched at 200 Hz; and those of 1, 10 and 50 hands, each with a bridge process and three
-touched pads at 100 Hz, through a Zenoh router to one subscriber. Processor time of each process shows what
-saturates first. Writes docs/benchmarks/bridges.{md,json}.
+ROS 2, with all pads touched; and those of 1, 10 and 50 hands, each with a bridge process and three touched
+pads at 100 Hz besides hand frames, through a Zenoh router to one subscriber, all on this machine. Latency is
+from sending by the publisher to a subscriber in Python; processor time of all processes of a kind per
+received wrench or contact. *Hands of a core*: by that time, so many hands fill a core of each kind of
+process; the least of them saturates first.
 """
 
 from __future__ import annotations
@@ -12,12 +14,10 @@ import contextlib
 import json
 import multiprocessing
 import os
-import platform
 import socket
 import subprocess
 import sys
 import tempfile
-import textwrap
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -30,12 +30,15 @@ import msgpack
 import numpy as np
 import zmq
 
-from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.page import Report, options
+from benchmarks.served_hand import processor_s
 from handtouch import config, wire
 from handtouch.config import shipped
+from tests.client.hand_messages import make_service
 
 LINKS = tuple(pad.link for pad in config.load(shipped.path("utah_mit.toml")).hands[0].pads)
 PREFIX = "lab"
+TOUCHED, FLEET_HZ = 3, 100.0
 START_S = 120.0
 _SENTINEL = 0x7A5A5A5A5A5A5A5A
 """Of `t_ns` in encoded messages: eight bytes that are replaced by the time of sending."""
@@ -67,12 +70,12 @@ def frame(hand: str) -> wire.HandFrame:
 
 def service(hands: Sequence[str]) -> wire.Service:
     """Return the state of a daemon, with the offset of the wall clock."""
-    return wire.Service(
-        v=1, session=1, seq=1, t_ns=_SENTINEL, wall_offset_ns=time.time_ns() - time.monotonic_ns(),
-        version="0", pid=1, uptime_s=1.0, period_s=5e-3, hands={hand: list(LINKS) for hand in hands},
-        ticks=1, overruns=0, rate_hz=200.0, core_compiled=True, tick_us={}, loop={}, contacts=0, rejected={},
-        process={}, buses={}, congestion_episodes={"complete": 0}, subscriptions=(), retained=False,
-    )  # fmt: skip
+    return make_service(
+        t_ns=_SENTINEL,
+        wall_offset_ns=time.time_ns() - time.monotonic_ns(),
+        hands={hand: list(LINKS) for hand in hands},
+        congestion_episodes={"complete": 0},
+    )
 
 
 def publish(endpoints: Sequence[str], touched: int, rate_hz: float, pipe: Connection) -> None:
@@ -212,12 +215,6 @@ class Part:
         return self._process.pid
 
 
-def cpu_s(*pids: int) -> float:
-    """Return the processor time of processes."""
-    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
-    return sum(int(stat[11]) + int(stat[12]) for stat in stats) / os.sysconf("SC_CLK_TCK")
-
-
 def start_bridge(opened: ExitStack, *arguments: str) -> int:
     """Start `handtouch bridge`; return its process."""
     command = [sys.executable, "-m", "handtouch", "bridge", *arguments]
@@ -252,12 +249,12 @@ def measure(
     if router is not None:
         pids["router"] = [router.pid]
     before_s, (first, old, _), begin_s = (
-        {name: cpu_s(*ids) for name, ids in pids.items()},
+        {name: processor_s(*ids) for name, ids in pids.items()},
         count(),
         time.monotonic(),
     )
     time.sleep(seconds)
-    used_s = {name: cpu_s(*ids) - before_s[name] for name, ids in pids.items()}
+    used_s = {name: processor_s(*ids) - before_s[name] for name, ids in pids.items()}
     (last, latencies, _), took_s = count(), time.monotonic() - begin_s
     publisher.pipe.send("stop")
     sent, sent_s = publisher.pipe.recv()
@@ -314,48 +311,26 @@ def measure_fleet(hands: int, touched: int, rate_hz: float, seconds: float) -> d
         return {"hands": hands, **measure(publisher, subscriber, bridges, router, seconds, hands)}
 
 
-def saturation(fleet: Sequence[dict[str, Any]], contacts_per_s: float) -> str:
-    """State how many hands of so many contacts a second fill a core of each process, by the largest fleet
-    that was received completely."""
-    complete = [row for row in fleet if row["received per s"] > 0.98 * row["sent per s"]]
-    if not complete:
-        return "No fleet was received completely."
-    row = complete[-1]
-    core = {name: 1e6 / (row[f"{name}, us"] * contacts_per_s) for name in ("bridges", "router", "subscriber")}
-    first = "router" if core["router"] < core["subscriber"] else "subscriber"
-    return (
-        f"By the processor time with {row['hands']} hands, the largest fleet received completely: a bridge "
-        f"takes {1 / core['bridges']:.3f} of a core of its robot; {core['router']:.0f} hands fill a core of "
-        f"the router, {core['subscriber']:.0f} one of the subscriber. So the {first} saturates first, unless "
-        f"bridges share a machine: {core['bridges']:.0f} of them fill a core."
-    )
-
-
 def main() -> None:
     """Measure and write the page."""
     parser = options(__doc__)
     parser.add_argument("--hands", type=int, nargs="*", help="numbers of hands of the fleet")
     arguments = parser.parse_args()
-    out, seconds = output_folder(arguments.quick), 3.0 if arguments.quick else 20.0
+    seconds = 3.0 if arguments.quick else 20.0
     fleet_hands = arguments.hands or ([1, 2] if arguments.quick else [1, 10, 50])
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    lines = ["# Bridges", "", f"{made_by()}; {machine}.", ""]
-    ros = [measure_ros(seconds, rate_hz) for rate_hz in ((200.0,) if arguments.quick else (50.0, 200.0))]
-    note = (
-        "Wrenches of 15 touched pads; latency from sending by the publisher to a subscriber in Python. "
-        "Processor time of each process per received wrench."
+    report = Report(arguments.quick, seconds_of_a_case=seconds)
+    report.table(
+        "ROS 2", [measure_ros(seconds, hz) for hz in ((200.0,) if arguments.quick else (50.0, 200.0))]
     )
-    lines += table("ROS 2", note, ros)
-    fleet = [measure_fleet(hands, 3, 100.0, seconds) for hands in fleet_hands]
-    note = (
-        "Contacts of three pads of each hand at 100 Hz, besides its hand frames; a bridge per hand, a "
-        "router, one subscriber, all on this machine. Processor time of all processes of a kind per received "
-        "contact."
-    )
-    lines += [*table("Fleet over Zenoh", note, fleet), *textwrap.wrap(saturation(fleet, 300.0), 110), ""]
-    (out / "bridges.md").write_text("\n".join(lines))
-    results = {"machine": machine, "ros2": ros, "fleet": fleet}
-    (out / "bridges.json").write_text(json.dumps(results, indent=1) + "\n")
+    fleet = [measure_fleet(hands, TOUCHED, FLEET_HZ, seconds) for hands in fleet_hands]
+    report.table("Fleet over Zenoh", fleet)
+    complete = [row for row in fleet if row["received per s"] > 0.98 * row["sent per s"]]
+    kinds, each = ("bridges", "router", "subscriber"), TOUCHED * FLEET_HZ
+    full = [
+        {"by hands": row["hands"]} | {k: 1e6 / (row[f"{k}, us"] * each) for k in kinds} for row in complete
+    ]
+    report.table("Hands of a core, by fleets received completely", full)
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,32 +1,26 @@
-"""Cost of `handtouch.Hand` in a control loop, beside bare ZeroMQ calls; age of its frame after a pause.
+"""Cost of reading the newest state: `handtouch.Hand` in a control loop, beside bare ZeroMQ calls.
 
-A publisher in the same process sends hand frames of 15 pads over a local socket. Control loops in C++ and in
-Python (client_reader) read them in a process of their own. Needs a C++ compiler and libzmq.
-Writes docs/benchmarks/client.{md,json}.
+A publisher in the same process sends hand frames of 15 pads over a local socket. *Cost*: median of a call,
+beside `zmq_poll` where no message waits, and `recv_multipart` with `unpackb` where one does. *Age*: of a
+program that pauses for 1 s while 200 frames a second arrive.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
-import platform
-import re
 import statistics
-import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import msgpack
 import zmq
 
 import handtouch
-from benchmarks.page import ROOT, made_by, options, output_folder, table
+from benchmarks.page import Report, options
 from handtouch import wire
 from handtouch.client.hand import Hand
 
@@ -35,8 +29,6 @@ PERIOD_S, PAUSE_S = 0.005, 1.0
 JOIN_MS = 10_000
 ARRIVAL_S = 0.001
 """From the arrival at one subscriber to that at the other"""
-READER = Path(__file__).with_name("client_reader")
-READER_TIMEOUT_S = 600.0
 
 
 def make_frame(seq: int) -> list[bytes]:
@@ -159,43 +151,6 @@ def publishing(socket: Any) -> Iterator[None]:
         thread.join()
 
 
-def measure_languages(frames: int) -> list[dict[str, Any]]:
-    """Return latency and cost of control loops in C++ and Python, and the lines of the loops in the docs."""
-    page = (ROOT / "docs" / "clients.md").read_text()
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        compiled = f"{folder}/reader"
-        include = ROOT / "clients" / "cpp" / "include"
-        compiler = ["c++", "-std=c++17", "-O2", f"-I{include}", f"{READER}.cpp", "-lzmq", "-o", compiled]
-        subprocess.run(compiler, check=True)
-        for language, mark, command in (
-            ("C++", "cpp", [compiled]),
-            ("Python", "python", [sys.executable, f"{READER}.py"]),
-        ):
-            with publisher() as (socket, endpoint), publishing(socket):
-                process = subprocess.run(
-                    [*command, endpoint, str(frames)],
-                    stdout=subprocess.PIPE,
-                    check=True,
-                    timeout=READER_TIMEOUT_S,
-                )
-            found = json.loads(process.stdout)
-            loop = re.search(rf"^```{mark}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-            assert loop is not None
-            rows.append(
-                {
-                    "loop": language,
-                    "lines": sum(map(bool, loop[1].splitlines())),
-                    "latency, us": found["latency_us"],
-                    "99 %, us": found["latency_p99_us"],
-                    "latest() without a frame, us": found["none_us"],
-                    "with one, us": found["one_us"],
-                    "age after a pause, ms": found["age_ms"],
-                }
-            )
-    return rows
-
-
 def measure_age() -> list[dict[str, Any]]:
     """Return the age [ms] of what `recv` and `latest` return after a pause, and the frames behind it."""
     with (
@@ -222,28 +177,10 @@ def measure_age() -> list[dict[str, Any]]:
 def main() -> None:
     """Measure and write the page."""
     quick = options(__doc__).parse_args().quick
-    out = output_folder(quick)
-    machine = f"{platform.machine()}, Python {platform.python_version()}, pyzmq {zmq.__version__}"
-    lines = ["# Cost of reading the newest state", "", f"{made_by()}; {machine}.", ""]
-    cost, age = measure_cost(20 if quick else 500), measure_age()
-    languages = measure_languages(100 if quick else 5000)
-    note = (
-        "Median of a call, beside `zmq_poll` where no message waits, and `recv_multipart` with `unpackb` "
-        "where one does; frames of 15 pads."
-    )
-    lines += table("Cost", note, cost)
-    note = f"Of a program that pauses for {PAUSE_S:g} s while {1 / PERIOD_S:g} frames a second arrive."
-    lines += table("Age after a pause", note, age)
-    note = (
-        "The same loop in two languages, each in a process of its own, beside a publisher of "
-        f"{1 / PERIOD_S:g} frames a second. `lines` are those of the loops in [clients](../clients.md). "
-        "Latency is from the frame's stamp, before it is encoded and sent, until `wait` returned it."
-    )
-    lines += table("C++ beside Python", note, languages)
-    (out / "client.md").write_text("\n".join(lines))
-    (out / "client.json").write_text(
-        json.dumps({"machine": machine, "cost": cost, "age": age, "languages": languages}, indent=1) + "\n"
-    )
+    report = Report(quick, pyzmq=zmq.__version__)
+    report.table("Cost", measure_cost(20 if quick else 500))
+    report.table("Age after a pause", measure_age())
+    report.keep()
 
 
 if __name__ == "__main__":

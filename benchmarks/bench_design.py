@@ -1,14 +1,17 @@
-"""Measure designs: three goals for the shipped fingertip, before and after, nominal and robust.
+"""Design of electrodes: three goals for the shipped fingertip, before and after, nominal and robust.
 
-Prints its tables and writes docs/benchmarks/design.md and design.json.
+`handtouch design` for `index_distal` of config/utah_mit.toml: worst value over the inner 80 %, within the
+default limits (gaps from 0.3 mm, electrodes from 3 mm, resistors to 1 kohm), in mm: standard deviation of
+position, least separation of two contacts, error of plain log-ratios. *Theory* is what is minimised;
+*simulated* are root mean squares over drawn pads of the reporting family, solved by the simulator's finite
+elements, the greatest of the grid's positions: of few pads it lies above that of many. *ideal* and *default*
+are [worlds](../worlds.md). Gaps follow y0, xa, yb and x0. *Number of electrodes*: anywhere on the boundary,
+0.3 N, noise only, theory.
 """
 
 from __future__ import annotations
 
-import json
-from typing import Any
-
-from benchmarks.page import ROOT, made_by, options, output_folder, progress, table
+from benchmarks.page import ROOT, Report, Row, options, progress
 from handtouch import config
 from handtouch.design import (
     GOALS,
@@ -21,8 +24,6 @@ from handtouch.design import (
     simulated_goal_map,
 )
 from handtouch.simulate.worlds import WORLDS, Family
-
-Row = dict[str, Any]
 
 LINK = "index_distal"
 POINTS = 9  # of a side
@@ -85,34 +86,12 @@ def count_rows(deployment: config.Deployment, starts: int) -> list[Row]:
 def main() -> None:
     parser = options(__doc__)
     quick = parser.parse_args().quick
-    out = output_folder(quick)
     deployment = config.load(ROOT / "config" / "utah_mit.toml")
     draws, starts = (2 if quick else DRAWS), 1
-    goals = goal_rows(deployment, draws, starts)
-    counts = count_rows(deployment, starts)
-    lines = [
-        "# Design of electrodes",
-        "",
-        f"`handtouch design` for `{LINK}` of config/utah_mit.toml: worst value over the inner 80 %, within "
-        "the default limits (gaps from 0.3 mm, electrodes from 3 mm, resistors to 1 kohm). *Theory* is what "
-        f"is minimised; *simulated* are root mean squares over {draws} pads of the reporting family, solved "
-        f"by the simulator's finite elements, the greatest of {POINTS**2} positions: of few pads it lies "
-        f"above that of many. *ideal* and *default* are worlds. {made_by()}.",
-        "",
-        *table(
-            "Goals",
-            "Worst values, mm: standard deviation of position, least separation of two contacts, error "
-            "of plain log-ratios. Gaps follow y0, xa, yb and x0.",
-            goals,
-        ),
-        *table(
-            "Number of electrodes",
-            "Anywhere on the boundary, 0.3 N, noise only, theory.",
-            counts,
-        ),
-    ]
-    (out / "design.md").write_text("\n".join(lines))
-    (out / "design.json").write_text(json.dumps({"goals": goals, "counts": counts}, indent=1) + "\n")
+    report = Report(quick, simulated_pads=draws, positions=POINTS**2)
+    report.table("Goals", goal_rows(deployment, draws, starts))
+    report.table("Number of electrodes", count_rows(deployment, starts))
+    report.keep()
 
 
 if __name__ == "__main__":

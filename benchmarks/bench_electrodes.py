@@ -1,17 +1,23 @@
-"""Measure intervals of pads with any number of electrodes, and two contacts at once, in worlds.
+"""Intervals of pads with other numbers of electrodes, and two contacts at once.
 
-The pads of config/electrodes.toml, with three and six electrodes, with hidden quantities drawn for seeds of
-the reporting family. Touches anywhere on them, and pairs of touches on the pad with six, go through the
-daemon's own pipeline; one sample of each is compared. Prints its tables and writes
-docs/benchmarks/electrodes.md and electrodes.json.
+The pads of [electrodes.toml](../../config/electrodes.toml), with three and six electrodes, with hidden
+quantities drawn for seeds of the reporting family. Touches of 0.2 to 12 N (log-uniform) anywhere on a pad's
+rectangle from 2 % of a side inside its edges, and pairs of touches on the pad with six, go through the
+daemon's own pipeline; one sample of each is compared, else as in [worlds](worlds.md). Touches of one pad
+share its parts: intervals are of touches on these pads, but those "of fingers" and of pairs, which follow
+from how they differ.
+
+*Two contacts at once*: 0.3 to 3 N each, at uniform positions from 5 % of a side inside the edges; sheets
+without creep and hysteresis, for which forces of two contacts aren't compensated; reported at a false-alarm
+rate of 0.1 %.
 """
 
 from __future__ import annotations
 
-import json
 import os
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -21,7 +27,6 @@ from numpy.typing import NDArray
 
 from benchmarks.bench_worlds import UNITS, WARM_UP, drawn_world, with_stated_touches
 from benchmarks.hand_touches import (
-    FORCES_N,
     REST_S,
     SAMPLE_S,
     STEP_S,
@@ -34,9 +39,8 @@ from benchmarks.hand_touches import (
     serve,
     tangent_basis,
 )
-from benchmarks.linear_pads import LinearPads, squared_deviation
-from benchmarks.page import made_by, options, output_folder, table
-from benchmarks.scores import ClusterShare, Estimates, EstimateScore, bin_labels, concatenate, slices
+from benchmarks.page import Report, options
+from benchmarks.scores import ClusterShare, Estimates, EstimateScore, Share, bin_labels, concatenate, slices
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
@@ -51,10 +55,6 @@ WORLDS = ("default", "harsh")
 PAIRED = "middle"
 PAIR_FORCES_N = (0.3, 3.0)
 DISTANCES_MM = (8.0, 12.0, 16.0)
-LINEAR_TOTALS_A = (0.6e-3, 2.5e-3)
-LINEAR = (10, 5)
-"""Single contacts and pairs of each pad whose currents are of first order."""
-LINEAR_PER_TASK = 25
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def play_pairs(world: str, finger: int, count: int) -> list[PlayedPair]:
     )
     hand = VirtualHand(deployment, Scenario(touch=touches), drawn)
     found = _serve_pairs(model, stated, hand, count)
-    return [_compare_pair(finger, contact, truths) for contact, truths in found]
+    return [compare_pair(finger, contact, truths) for contact, truths in found]
 
 
 def play_finger(world: str, number: int, touches: int, pairs: int) -> tuple[Played, list[PlayedPair]]:
@@ -153,7 +153,7 @@ def _serve_pairs(
     return [(contacts.get((k, PAIRED)), list(hand.truth(float(times_s[tick])))) for tick, k in ticks.items()]
 
 
-def _compare_pair(finger: int, contact: wire.Contact | None, truths: list[GroundTruth]) -> PlayedPair:
+def compare_pair(finger: int, contact: wire.Contact | None, truths: list[GroundTruth]) -> PlayedPair:
     """Compare two reported contacts with the true ones that they are nearer to."""
     true_m = np.array([truth.position_m for truth in truths])
     distance_mm = 1e3 * float(np.linalg.norm(true_m[1] - true_m[0]))
@@ -176,64 +176,9 @@ def _compare_pair(finger: int, contact: wire.Contact | None, truths: list[Ground
     return PlayedPair(finger, distance_mm, True, *zip(*rows, strict=True))
 
 
-def play_linear(numbers: range, touches: int, pairs: int) -> tuple[list[tuple[int, float]], list[PlayedPair]]:
-    """Return finger and squared deviation of single contacts, and pairs, on pads drawn in `default` whose
-    currents follow from their parts to first order."""
-    first = drawn_world("default", numbers.start)
-    first = DrawnWorld(first.world.with_sheets(), first.seed)
-    stated = with_stated_touches(first.describe(load(shipped.path("electrodes.toml"))), first)
-    row = [pad.link for _, pad in stated.pads].index(PAIRED)
-    pads, singles, found = LinearPads(stated, row), [], []
-    low, high = np.log(LINEAR_TOTALS_A)
-    for number in numbers:
-        drawn = drawn_world("default", number)
-        rng = np.random.default_rng((drawn.seed, 7))
-        s, t = rng.uniform(0.05, 0.95, (2, touches + pairs, 2))
-        totals = np.exp(rng.uniform(low, high, (touches + pairs, 2)))
-        totals[:touches, 1] = 0.0
-        currents = pads.draw_currents(drawn, s, t, totals, rng)
-        true_m = pads.position_m(s, t)
-        for k, sample in enumerate(currents.T):
-            position_m, covariance_m2, parts = pads.solve(sample)
-            if k < touches:
-                singles.append((number, squared_deviation(position_m - true_m[k, 0], covariance_m2)))
-                continue
-            distance_mm = 1e3 * float(np.linalg.norm(true_m[k, 1] - true_m[k, 0]))
-            if np.isnan(parts[0, 0]):
-                found.append(PlayedPair(number, distance_mm, False))
-                continue
-            at, truth, unknown = parts[:, :3], true_m[k], (np.nan, np.nan)
-            if np.linalg.norm(at - truth, axis=1).sum() > np.linalg.norm(at - truth[::-1], axis=1).sum():
-                truth = truth[::-1]
-            errors = at - truth
-            squares = [
-                squared_deviation(error, part[6:15].reshape(3, 3))
-                for error, part in zip(errors, parts, strict=True)
-            ]
-            lengths = np.linalg.norm(errors, axis=1).tolist()
-            std_m = np.sqrt(parts[:, [6, 10, 14]].sum(axis=1)).tolist()
-            found.append(
-                PlayedPair(
-                    number, distance_mm, True, tuple(squares), unknown, tuple(lengths), unknown, tuple(std_m)
-                )
-            )
-    return singles, found
-
-
-def linear_rows(singles: list[tuple[int, float]]) -> list[dict[str, Any]]:
-    """Return the shares of single contacts in their regions."""
-    finger, square = (np.array(column) for column in zip(*singles, strict=True))
-    row: dict[str, Any] = {"contacts": len(singles)}
-    for level in (0.5, 0.9, 0.95, 0.99):
-        row[f"in {100 * level:g} %"] = share_of(square < -2 * np.log(1 - level), finger)
-    in_region = np.array([np.mean(square[finger == one] < 5.991) for one in np.unique(finger)])
-    row["fingers below 85 % in 95 %, %"] = f"{100 * np.mean(in_region < 0.85):.1f}"
-    return [row]
-
-
-def pair_rows(pairs: list[PlayedPair]) -> list[dict[str, Any]]:
+def pair_rows(pairs: list[PlayedPair], distances_mm: Sequence[float] = DISTANCES_MM) -> list[dict[str, Any]]:
     """Return shares of pairs reported, and of these in their regions, by distance."""
-    labels = bin_labels(np.array([pair.distance_mm for pair in pairs]), DISTANCES_MM, "mm")
+    labels = bin_labels(np.array([pair.distance_mm for pair in pairs]), distances_mm, "mm")
     rows = []
     for label in sorted(set(labels.tolist())):
         own = [pair for pair, of in zip(pairs, labels.tolist(), strict=True) if of == label]
@@ -270,13 +215,13 @@ def rows_of(every: Estimates, quantity: str) -> list[dict[str, Any]]:
             row = EstimateScore.of_estimates(part).row(UNITS[quantity][1], bounds=False)
             hits = part.where(part.valid)
             row["in 95 %, of fingers"] = share_of(hits.stated_levels() <= 0.95, hits.columns["finger"])
-            rows.append({"": name, **row})
+            rows.append({"case": name, **row})
     return rows
 
 
-def share_of(hits: NDArray[np.bool_], finger: NDArray[Any]) -> str:
+def share_of(hits: NDArray[np.bool_], finger: NDArray[Any]) -> ClusterShare | None:
     """Return a share with the interval that the scatter between fingers gives."""
-    return str(ClusterShare.of_mask(hits, finger)) if len(np.unique(finger)) > 1 else "-"
+    return ClusterShare.of_mask(hits, finger) if len(np.unique(finger)) > 1 else None
 
 
 def main() -> None:
@@ -285,13 +230,12 @@ def main() -> None:
     parser.add_argument("--touches", type=int, default=16, help="of each pad")
     parser.add_argument("--paired", type=int, default=40, help="fingers with pairs of touches")
     parser.add_argument("--pairs", type=int, default=8, help="of each paired finger")
-    parser.add_argument("--linear", type=int, default=200, help="pads whose currents are of first order")
     asked = parser.parse_args()
     if asked.quick:
-        asked.hands, asked.touches, asked.paired, asked.pairs, asked.linear = 2, 3, 2, 6, 8
-    page = ["# Intervals of pads with other numbers of electrodes", "", f"{made_by()}.", ""]
-    page += [HEAD.format(hands=asked.hands, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1]), ""]
-    record: dict[str, Any] = {}
+        asked.hands, asked.touches, asked.paired, asked.pairs = 2, 3, 2, 6
+    report = Report(
+        asked.quick, hands=asked.hands, touches_of_a_pad=asked.touches, pairs_of_fingers=asked.paired
+    )
     for world in WORLDS:
         made, pairs = [], []
         with ProcessPoolExecutor(min(asked.hands, os.cpu_count() or 1)) as pool:
@@ -308,63 +252,11 @@ def main() -> None:
             quantity: concatenate([finger.estimates[quantity] for finger in made]) for quantity in ERRORS
         }
         for quantity, every in found.items():
-            text = f"As configured. Errors and deviations in {UNITS[quantity][0]}."
-            page += table(f"{quantity.capitalize()} in `{world}`", text, rows_of(every, quantity))
-            for pad, part in slices(every, "pad"):
-                record[f"{world}, {pad}, {quantity}"] = asdict(EstimateScore.of_estimates(part))
+            report.table(f"{quantity.capitalize()} in `{world}`", rows_of(every, quantity))
         false = np.array([one for finger in made for one in finger.false_pairs])
-        text = PAIRS.format(
-            low=PAIR_FORCES_N[0],
-            high=PAIR_FORCES_N[1],
-            false=int(false.sum()),
-            touches=len(false),
-            fingers=asked.paired,
-        )
-        rows = pair_rows(pairs)
-        page += table(f"Two contacts at once in `{world}`", text, rows)
-        record[f"{world}, pairs"] = rows
-        record[f"{world}, touches reported as two"] = [int(false.sum()), len(false)]
-    starts = range(0, asked.linear, LINEAR_PER_TASK)
-    singles, pairs = [], []
-    with ProcessPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
-        ranges = [range(start, min(start + LINEAR_PER_TASK, asked.linear)) for start in starts]
-        for some, more in pool.map(play_linear, ranges, *([count] * len(ranges) for count in LINEAR)):
-            singles += some
-            pairs += more
-    text = LINEAR_TEXT.format(pads=asked.linear, contacts=LINEAR[0], pairs=LINEAR[1])
-    contacts = linear_rows(singles)
-    page += table("Many pads in `default`", text, contacts)
-    rows = [
-        {name: value for name, value in row.items() if "force" not in name and ", N" not in name}
-        for row in pair_rows(pairs)
-    ]
-    page += table("Two contacts at once on many pads in `default`", LINEAR_PAIRS, rows)
-    record["many pads"] = {"contacts": contacts, "pairs": rows}
-    out = output_folder(asked.quick)
-    (out / "electrodes.md").write_text("\n".join(page))
-    (out / "electrodes.json").write_text(json.dumps(record, indent=1).replace("NaN", "null") + "\n")
-
-
-HEAD = """\
-{hands} fingers of [electrodes.toml](../../config/electrodes.toml) drawn in the [worlds](../worlds.md)
-`default` and `harsh`, seeds of the reporting family; {touches} touches of each pad, {low:g} to {high:g} N
-(log-uniform), at uniform positions of the drawing's rectangle from 2 % of a side inside its edges; else as in
-[worlds](worlds.md). Touches of one pad share its parts: intervals are of touches on these pads, but those
-"of fingers", which follow from how they differ."""
-PAIRS = """\
-Two touches at once on the pad with six electrodes, {low:g} to {high:g} N each, at uniform positions from 5 %
-of a side inside its edges; parts of {fingers} fingers, sheets without creep and hysteresis, for
-which forces of two contacts aren't compensated. Reported at a false-alarm rate of 0.1 %; of the {touches}
-single touches above {false} were reported as two. Intervals are of fingers."""
-
-LINEAR_TEXT = """\
-A few fingers can't show coverage: what moves the contacts of one pad is the same for all of them, so that
-whole pads lie inside or outside of their regions. Here {pads} pads with six electrodes are drawn, of the same
-seeds, with {contacts} single contacts and {pairs} pairs each. Their currents follow from gaps, gains,
-anisotropy and size to first order of the daemon's model, without solving their sheets; total currents are
-log-uniform, 0.6 to 2.5 mA, without drift. It shows whether the likelihood and its covariance are those of
-such parts; errors of the model are in the tables above."""
-LINEAR_PAIRS = "As the table above, positions alone."
+        report.table(f"Two contacts at once in `{world}`", pair_rows(pairs))
+        report.table(f"Single contacts reported as two in `{world}`", [{"share, %": Share.of_mask(false)}])
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
-"""Savings by scenes: bus load, ticks and CPU time of unneeded pads, and wake-up time of idle ones.
+"""Savings by scenes: bus load, ticks and processor time of unneeded pads, and wake-up of idle ones.
 
-The real daemon serves simulated nodes over udp_multicast, as in bench_latency. Each case is the hand in one
-scene, touched so much; then, again and again, one pad of an idle hand is touched, and its samples are timed
-from the first event frame on. Writes docs/benchmarks/idle.{md,json}.
+15 pads at 200 Hz on one bus of 1 Mbit/s; nodes and daemon run in processes of their own, with udp_multicast
+over loopback. A node outside the scene is stopped with its excitation off; it sends heartbeats only. A node
+in the scene that is untouched for `idle_after_s` transmits when a channel changes by `delta_counts`, and at
+least ten times a second; when all nodes do so, SYNC slows down to `idle_sync_period_ms`. *Wake-up*: periods
+from the first event frame of a touched pad to its next sample, which follows SYNC at full rate, touched at
+random times; then the share of the full rate.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -21,8 +21,8 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bench_latency import PORT, ProcessorShare, in_own_network, on_loopback, open_bus
-from benchmarks.page import made_by, options, output_folder
+from benchmarks.page import Report, options
+from benchmarks.served_hand import PORT, ProcessorShare, in_own_network, on_loopback, open_bus
 from handtouch.client import request
 from handtouch.config import Deployment, load
 from handtouch.device import DeviceBus
@@ -106,10 +106,10 @@ class Daemon:
             for k in ("bits", "samples")
         }
         return {
-            "bus_load": grown["bits"] / took_s / self.deployment.buses[0].bitrate_bit_s,
-            "samples_hz": grown["samples"] / took_s,
-            "ticks_hz": (after["service"]["ticks"] - before["service"]["ticks"]) / took_s,
-            "processor_share": processor,
+            "bus load, %": 100 * grown["bits"] / took_s / self.deployment.buses[0].bitrate_bit_s,
+            "samples/s": grown["samples"] / took_s,
+            "ticks/s": (after["service"]["ticks"] - before["service"]["ticks"]) / took_s,
+            "daemon, % of a core": 100 * processor,
         }
 
     def stop(self) -> None:
@@ -166,12 +166,12 @@ def wakes(folder: Path, trials: int) -> dict[str, Any]:
     rates = np.array([rate for _, rate in found])
     return {
         "trials": trials,
-        "period_ms": period_s * 1e3,
-        "median_periods": float(np.median(delays)),
-        "p95_periods": float(np.percentile(delays, 95)),
-        "worst_periods": float(delays.max()),
-        "within_two_periods": float((delays <= 2).mean()),
-        "rate_after": float(np.median(rates)),
+        "period, ms": period_s * 1e3,
+        "median, periods": float(np.median(delays)),
+        "95 %": float(np.percentile(delays, 95)),
+        "worst": float(delays.max()),
+        "within two periods, %": 100 * float((delays <= 2).mean()),
+        "rate after": float(np.median(rates)),
     }
 
 
@@ -188,39 +188,6 @@ def full_rate_after(stamps: NDArray[np.float64], period_s: float) -> tuple[float
     return float(later[0]), len(later) / (FOLLOWED - float(later[0]))
 
 
-def write(results: dict[str, Any], out: Path) -> str:
-    rows = "\n".join(
-        f"| {r['scene']} | {r['touched']} of 15 | {100 * r['bus_load']:.1f} % | {r['samples_hz']:.0f} "
-        f"| {r['ticks_hz']:.0f} | {100 * r['processor_share']:.0f} % |"
-        for r in results["loads"]
-    )
-    wake = results["wake"]
-    text = f"""# Savings by scenes
-
-15 pads at 200 Hz on one bus of 1 Mbit/s; nodes and daemon run in separate processes, with udp_multicast over
-loopback. {results["machine"]}.
-
-| scene | touched | bus load | samples/s | ticks/s | daemon's share of a core |
-| --- | --- | --- | --- | --- | --- |
-{rows}
-
-A node outside the scene is stopped with its excitation off; it sends heartbeats only. A node in the scene
-that is untouched for `idle_after_s` transmits when a channel changes by `delta_counts`, and at least
-ten times a second; when all nodes do so, SYNC slows down to `idle_sync_period_ms`.
-
-**Wake-up**: from the first event frame of a touched pad to its next sample, which follows SYNC at full
-rate: median {wake["median_periods"]:.2f} periods, 95 % {wake["p95_periods"]:.2f}, worst
-{wake["worst_periods"]:.2f} ({wake["trials"]} touches at random times;
-{100 * wake["within_two_periods"]:.1f} % within two). Afterwards {100 * wake["rate_after"]:.0f} % of the
-full rate.
-
-{made_by()}.
-"""
-    (out / "idle.md").write_text(text)
-    (out / "idle.json").write_text(json.dumps(results, indent=1) + "\n")
-    return text
-
-
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--seconds", type=float, default=6.0, help="of each case")
@@ -230,11 +197,10 @@ def main() -> None:
         asked.seconds, asked.trials = 1.0, 3
     in_own_network()
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
-        results = {"loads": loads(Path(folder), asked.seconds), "wake": wakes(Path(folder), asked.trials)}
-    results["machine"] = (
-        f"{platform.machine()}, {os.cpu_count()} processors, Python {platform.python_version()}"
-    )
-    print(write(results, output_folder(asked.quick)))
+        report = Report(asked.quick, seconds_of_a_case=asked.seconds)
+        report.table("Load", loads(Path(folder), asked.seconds))
+        report.table("Wake-up", [wakes(Path(folder), asked.trials)])
+    report.keep()
 
 
 if __name__ == "__main__":

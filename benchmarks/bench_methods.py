@@ -1,47 +1,262 @@
-"""Run time against error of every way to locate a contact, and where the compiled core stands among them.
+"""Run time against error of location: every way to locate a contact, and the compiled core among them.
 
-On an ideal pad, on one with gaps and series resistors (both without noise, exact currents), and in the world
-`default`, whose tolerances and noise no way knows; for 1, 15, 60 and 960 contacts in one call and in bulk.
-Writes docs/benchmarks/methods.{md,json,png}.
+A plane pad of 30 x 24 mm. *Ideal*: no gaps, no resistors; *gaps and resistors*: 1.2 mm bare at each end of an
+electrode, 120 ohm in series with each, all known; both without noise, exact currents, and so the error is the
+method's own. *World default*: the same file, pads drawn for a seed of the reporting family, 0.5 to 5 N,
+simulated by finite elements with noise and quantisation: nothing that was drawn is known. All errors are of
+contacts 5 % of a side and farther from the edges; positions off the pad are clipped to it. The paper's ways
+and the interpolator assume an ideal pad.
+
+Microseconds are processor time per contact, medians; spread: half the distance of quartiles, the largest of
+the columns. least_squares takes one contact after the other and is timed for up to 15. Core: the daemon's
+stages, with covariance and place on the link, in calls of 60 contacts at most; *tracked*: from the last
+position, 0.1 mm away. Bulk: 20,000 contacts. *Floors*: rms of the least error by noise (Cramer-Rao, at 1 mA),
+and of an oracle that knows the distributions of all tolerances, but no values.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import product
+from typing import Any, Literal
 
-from tests.exact_pads import ExactPads
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import matplotlib
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+from scipy.optimize import least_squares
 
-from benchmarks.locators import CORE_PADS, LENGTH_MM, WAYS, WIDTH_MM, Locator, Setup
 from benchmarks.oracle import PadOracle
-from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.page import Report, Rows, options, progress
 from benchmarks.scores import laplace_covariance
+from handtouch import config
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
+from handtouch.core.pad_model import PadModel
 from handtouch.core.stages import solve
+from handtouch.field import ElectrodeNetwork, Rectangle
+from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
+from handtouch.hand import electrode_network
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, Family, MountSpread
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
+from tests.deployments import deployment_text, pad_text
+from tests.exact_pads import ExactPads
 
 FloatArray = NDArray[np.float64]
+Position = tuple[FloatArray, FloatArray]
+Locator = Callable[[FloatArray], Position]
+"""Positions x, y (n,) [m] from currents (4, n) [A] of x0, xa, y0, yb."""
+
+LENGTH_MM, WIDTH_MM = 30.0, 24.0
+CORE_PADS = 60
+"""Pads of the core's model; more contacts are solved in several calls."""
+CELLS, TRAINED, DEGREE = 64, 20_000, 11
+MARGIN = 0.02
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A plane pad of 30 x 24 mm and what its builder knows of it."""
+
+    gap_mm: float
+    series_ohm: float
+
+    def deployment(self, pads: int) -> config.Deployment:
+        """Return a deployment with so many pads of this kind."""
+        surface = f'{{ kind = "plane", length_mm = {LENGTH_MM}, width_mm = {WIDTH_MM} }}'
+        extra = f"series_ohm = {[self.series_ohm] * 4}"
+        texts = [pad_text(f"p{k}", k + 1, surface, extra, gap_mm=self.gap_mm) for k in range(pads)]
+        return config.parse(deployment_text(*texts, daemon=""))
+
+    @cached_property
+    def model(self) -> PadModel:
+        """`CORE_PADS` such pads as the daemon has them."""
+        return PadModel(self.deployment(CORE_PADS))
+
+    @cached_property
+    def pad(self) -> Rectangle | ElectrodeNetwork:
+        """The exact forward model."""
+        if not self.gap_mm:
+            return self.rectangle
+        deployment = self.deployment(1)
+        pad = deployment.pads[0].pad
+        return electrode_network(pad, deployment.sheets[pad.sheet])
+
+    @property
+    def rectangle(self) -> Rectangle:
+        """The pad without gaps and resistors, which the paper's methods assume."""
+        return Rectangle(1e-3 * LENGTH_MM, 1e-3 * WIDTH_MM)
+
+    @property
+    def noise_a(self) -> FloatArray:
+        """Standard deviations (4, 1) of the channels."""
+        return np.asarray(self.model.noise_a[0][:, None])
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to locate; `make` builds its tables."""
+
+    make: Callable[[Setup], Locator]
+    kind: Literal["core", "handtouch", "paper", "instead"]
+    ideal_only: bool = False
+    """For pads without gaps and resistors alone."""
+    samples: int = 20_000
+    """Contacts of which errors are measured; few for slow ones, which take one contact after the other."""
+
+
+# Of the paper and of handtouch
+
+
+def exact(setup: Setup) -> Locator:
+    def locate(currents: FloatArray) -> Position:
+        found = setup.pad.locate(currents)
+        return found.x, found.y
+
+    return locate
+
+
+def likelihood(setup: Setup) -> Locator:
+    def locate(currents: FloatArray) -> Position:
+        found = setup.pad.estimate(currents, setup.noise_a)
+        return found.x, found.y
+
+    return locate
+
+
+def core(setup: Setup, *, tracked: bool) -> Locator:
+    """Return the daemon's stages, compiled where they are: position, covariance and place on the link.
+
+    If tracked, the contact in a column is located from its last position.
+    """
+    size = setup.model.size
+    rows, columns = np.arange(size), VALUE_SLICES["xy"]
+    parts: list[tuple[ContactSolver, FloatArray, FloatArray]] = []
+
+    def part(number: int) -> tuple[ContactSolver, FloatArray, FloatArray]:
+        while len(parts) <= number:
+            given, values = np.zeros((size, 4)), np.full((size, VALUE_COUNT), np.nan)
+            force = np.zeros(size, np.bool_)
+            parts.append((make_solver(setup.model, given, np.zeros(size), force, values), given, values))
+        return parts[number]
+
+    def locate(currents: FloatArray) -> Position:
+        found = np.empty((currents.shape[1], 2))
+        for number, first in enumerate(range(0, len(found), size)):
+            solver, given, values = part(number if tracked else 0)
+            columns_now = currents[:, first : first + size].T
+            n = len(columns_now)
+            given[:n] = columns_now
+            if not tracked:
+                values[:n] = np.nan
+            solver.solve_contacts(rows[:n].data)
+            found[first : first + n] = values[:n, columns]
+        return found[:, 0], found[:, 1]
+
+    return locate
+
+
+# What a user would take instead
+
+
+def nominal_contacts(setup: Setup, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return positions (2, count) [m] and fractions (4, count) of contacts by the forward model."""
+    sides = np.array([[setup.pad.a], [setup.pad.b]])
+    at = sides * np.random.default_rng(11).uniform(MARGIN, 1 - MARGIN, (2, count))
+    return at, setup.pad.fractions(*at)
+
+
+def polynomial(setup: Setup) -> Locator:
+    """Return a regression on the two ratios of opposite sides, of degree 11, trained on 20 000 contacts."""
+    powers = np.array([p for p in product(range(DEGREE + 1), repeat=2) if sum(p) <= DEGREE])
+
+    def features(currents: FloatArray) -> FloatArray:
+        low, high = currents[::2], currents[1::2]
+        ratios = (high - low) / (high + low)
+        x, y = ratios[:, None] ** np.arange(DEGREE + 1)[:, None]  # (powers, n) each
+        return np.asarray((x[powers[:, 0]] * y[powers[:, 1]]).T)
+
+    at, fractions = nominal_contacts(setup, TRAINED)
+    weights, *_ = np.linalg.lstsq(features(fractions), at.T, rcond=None)
+
+    def locate(currents: FloatArray) -> Position:
+        x, y = (features(currents) @ weights).T
+        return x, y
+
+    return locate
+
+
+def grid_interpolator(setup: Setup) -> Locator:
+    """Return eq. 8 corrected by scipy's cubic RegularGridInterpolator, as in a look-up table of one's own."""
+    adjusted, table = LogRatioTable(setup.rectangle, cells=0), LogRatioTable(setup.rectangle, CELLS)
+    places, origin, steps = table.correction_table
+    axes = [origin[i] + steps[i] * np.arange(CELLS + 1) for i in range(2)]
+    interpolator = RegularGridInterpolator(axes, places, method="cubic", bounds_error=False, fill_value=None)
+
+    def locate(currents: FloatArray) -> Position:
+        found = interpolator(np.stack(adjusted.locate(currents), axis=-1))
+        return found[..., 0], found[..., 1]
+
+    return locate
+
+
+def fit_of_sums(setup: Setup) -> Locator:
+    """Return scipy's least_squares on the paper's eqs. 4-5, ten terms."""
+    return _one_by_one(setup, lambda x, y: single_sum_fractions(setup.rectangle, x, y))
+
+
+def fit_of_field(setup: Setup) -> Locator:
+    """Return scipy's least_squares on the exact forward model."""
+    return _one_by_one(setup, lambda x, y: setup.pad.fractions(x, y))
+
+
+def _one_by_one(setup: Setup, forward: Callable[[float, float], FloatArray]) -> Locator:
+    a, b = setup.rectangle.a, setup.rectangle.b
+    bounds = (1e-3 * a, 1e-3 * b), (0.999 * a, 0.999 * b)
+
+    def misfit(point: FloatArray, fractions: FloatArray) -> FloatArray:
+        return forward(float(point[0]), float(point[1])) - fractions
+
+    def locate(currents: FloatArray) -> Position:
+        found = [
+            least_squares(
+                misfit, (a / 2, b / 2), bounds=bounds, args=(column / column.sum(),), x_scale=(a, b),
+                xtol=1e-12, ftol=1e-12, gtol=1e-12,
+            ).x
+            for column in currents.T
+        ]  # fmt: skip
+        x, y = np.array(found).T
+        return x, y
+
+    return locate
+
+
+WAYS: dict[str, Way] = {
+    "log-ratio (eq. 8)": Way(lambda setup: lambda currents: log_ratio(setup.rectangle, currents), "paper"),
+    "log-ratio, adjusted (fig. 3)": Way(
+        lambda setup: LogRatioTable(setup.rectangle, cells=0).locate, "paper"
+    ),
+    "log-ratio, table of 32 cells": Way(lambda setup: LogRatioTable(setup.rectangle).locate, "paper"),
+    "exact inverse": Way(exact, "handtouch"),
+    "likelihood, exact field": Way(likelihood, "handtouch"),
+    "core, new contacts": Way(lambda setup: core(setup, tracked=False), "core"),
+    "core, tracked contacts": Way(lambda setup: core(setup, tracked=True), "core"),
+    "polynomial regression": Way(polynomial, "instead"),
+    "RegularGridInterpolator": Way(grid_interpolator, "instead"),
+    "least_squares, eqs. 4-5": Way(fit_of_sums, "instead", samples=200),
+    "least_squares, exact field": Way(fit_of_field, "instead", samples=100),
+}
+"""By name."""
+
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 CALLS = (1, 15, 60, 960)
 BULK = 20_000
 MARGIN = 0.05
@@ -53,14 +268,6 @@ BATCH_S, BATCHES, FEW_BATCHES = 0.02, 15, 3
 IDEAL, BUILT = Setup(0.0, 0.0), Setup(1.2, 120.0)
 WORLD_PADS, WORLD_TOUCHES, STEP_S = 30, 40, 0.5
 FORCES_N = (0.5, 5.0)
-COLOURS = {"core": "#c23b22", "handtouch": "#1f6fb4", "paper": "#8a8a8a", "instead": "#e08214"}
-LEGEND = {
-    "core": "the daemon's core",
-    "handtouch": "other ways in handtouch",
-    "paper": "the paper's",
-    "instead": "what one would take instead",
-}
-MIN_SHOWN_MM = 1e-16
 
 
 @dataclass(frozen=True)
@@ -73,22 +280,6 @@ class Case:
     error_m: Callable[[FloatArray, FloatArray], FloatArray]
     floors_mm: dict[str, float]
     """Rms errors that no way can beat, by cause."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One way in one case: errors [mm], microseconds a contact by contacts in a call, spread in %."""
-
-    case: str
-    method: str
-    kind: str
-    contacts: int
-    rms_mm: float
-    median_mm: float
-    worst_mm: float
-    no_answer_percent: float
-    us_per_contact: dict[str, float]
-    spread_percent: float
 
 
 def position_bound_mm(setup: Setup, x: FloatArray, y: FloatArray, total_a: float) -> float:
@@ -217,164 +408,33 @@ def errors_mm(case: Case, name: str, locate: Locator) -> FloatArray:
     return 1e3 * case.error_m(*clipped)
 
 
-def measure(cases: Sequence[Case], quick: bool) -> list[Row]:
+def measure(cases: Sequence[Case], quick: bool) -> dict[str, Rows]:
     """Return the rows of all ways; cases of one setup share its tables and run times."""
-    rows: list[Row] = []
+    rows: dict[str, Rows] = {case.name: [] for case in cases}
     for setup in dict.fromkeys(case.setup for case in cases):
         for name, way in WAYS.items():
             if way.ideal_only and setup != IDEAL:
                 continue
-            began = time.monotonic()
             locate = way.make(setup)
             us, spread = times(setup, name, locate, quick)
             for case in (case for case in cases if case.setup == setup):
                 error = errors_mm(case, name, locate)
                 known = error[np.isfinite(error)]
-                rows.append(
-                    Row(
-                        case.name, name, way.kind, len(error), float(np.sqrt(np.mean(known**2))),
-                        float(np.median(known)), float(known.max()),
-                        100 * (1 - len(known) / len(error)), us, spread,
-                    )
-                )  # fmt: skip
-                print(
-                    f"{case.name}: {name}: rms {rows[-1].rms_mm:.2g} mm; "
-                    + ", ".join(f"{count}: {t:.3g} us" for count, t in us.items())
-                    + f"; {time.monotonic() - began:.0f} s",
-                    flush=True,
+                rows[case.name].append(
+                    {
+                        "kind": way.kind,
+                        "way": name,
+                        "rms, mm": f"{np.sqrt(np.mean(known**2)):.1e}",
+                        "median": f"{np.median(known):.1e}",
+                        "worst": f"{known.max():.1e}",
+                        "no answer, %": 100 * (1 - len(known) / len(error)),
+                        **{f"us each, {n} in a call": us.get(str(n)) for n in CALLS},
+                        "us each, bulk": us.get("bulk"),
+                        "spread, %": spread,
+                    }
                 )
+                progress(rows[case.name][-1])
     return rows
-
-
-def section(case: Case, rows: Sequence[Row]) -> list[str]:
-    floors = "; ".join(f"{name} {value:.3g} mm" for name, value in case.floors_mm.items())
-    cells = [
-        {
-            "way": row.method,
-            "rms, mm": f"{row.rms_mm:.1e}",
-            "median": f"{row.median_mm:.1e}",
-            "worst": f"{row.worst_mm:.1e}",
-            "no answer, %": f"{row.no_answer_percent:.2g}",
-            **{
-                f"us each, {count}": f"{row.us_per_contact[key]:.3g}" if key in row.us_per_contact else ""
-                for count, key in [*((f"{n} in a call", str(n)) for n in CALLS), ("bulk", "bulk")]
-            },
-            "spread, %": f"{row.spread_percent:.0f}",
-        }
-        for row in rows
-        if row.case == case.name
-    ]
-    note = f"{case.currents.shape[1]} contacts. Least rms error: {floors}."
-    return table(case.name.capitalize(), note, cells)
-
-
-def draw(cases: Sequence[Case], rows: Sequence[Row], path: Path) -> None:
-    """Draw a panel per case: each way is a line from its cost for single contacts to that in bulk."""
-    figure, panels = plt.subplots(1, len(cases), figsize=(18, 7.5), layout="constrained")
-    for axes, case in zip(panels, cases, strict=True):
-        own = [row for row in rows if row.case == case.name]
-        for row in own:
-            draw_way(axes, row)
-        axes.axhspan(1e-17, max(case.floors_mm.values()), color="#2e8b57", alpha=0.06, lw=0)
-        for (name, floor), style in zip(case.floors_mm.items(), ("-", ":"), strict=False):
-            axes.axhline(floor, color="#2e8b57", lw=1.2, ls=style, zorder=0)
-            axes.annotate(
-                f"{name}: {floor:.2g} mm", (0.995, floor), xycoords=("axes fraction", "data"), ha="right",
-                va="bottom", fontsize=8, color="#2e8b57",
-            )  # fmt: skip
-        axes.set(xscale="log", yscale="log", xlabel="microseconds a contact", title=case.name)
-        shown = [row.rms_mm for row in own] + list(case.floors_mm.values())
-        axes.set_ylim(max(min(shown), MIN_SHOWN_MM) / 2, 2 * max(shown))
-        axes.grid(alpha=0.25)
-        axes.margins(x=0.12)
-        label_ways(axes, own)
-    panels[0].set_ylabel(f"rms error, mm, on a pad of {LENGTH_MM:g} x {WIDTH_MM:g} mm (5 % margin)")
-    for kind, words in LEGEND.items():
-        panels[0].plot([], [], "o-", color=COLOURS[kind], label=words)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(
-        "Ways to locate a contact. Dots from right to left: 1, 15, 60, 960 contacts in a call, bulk (ring). "
-        "Shaded: below the noise or the tolerances"
-    )
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
-def draw_way(axes: Axes, row: Row) -> None:
-    us, height = list(row.us_per_contact.values()), max(row.rms_mm, MIN_SHOWN_MM)
-    is_core = row.kind == "core"
-    axes.plot(
-        us, [height] * len(us), "o-", color=COLOURS[row.kind], ms=6 if is_core else 4,
-        lw=2.5 if is_core else 1.2, zorder=3 if is_core else 2,
-    )  # fmt: skip
-    if "bulk" in row.us_per_contact:
-        axes.plot(
-            row.us_per_contact["bulk"], height, "o", ms=9, mfc="none", color=COLOURS[row.kind], zorder=4
-        )
-
-
-def label_ways(axes: Axes, rows: Sequence[Row]) -> None:
-    """Write the names in a column right of the points, at least a line apart, with a thin leader."""
-    ordered = sorted(rows, key=lambda row: row.rms_mm)
-    low, high = np.log10(axes.get_ylim())
-    wanted = np.array([(np.log10(max(row.rms_mm, MIN_SHOWN_MM)) - low) / (high - low) for row in ordered])
-    gap = 0.03
-    heights = wanted.copy()
-    for k in range(1, len(heights)):
-        heights[k] = max(heights[k], heights[k - 1] + gap)
-    if (excess := heights[-1] - 0.985) > 0:
-        heights[-1] -= excess
-        for k in range(len(heights) - 2, -1, -1):
-            heights[k] = min(heights[k], heights[k + 1] - gap)
-    for row, height in zip(ordered, heights.tolist(), strict=True):
-        axes.annotate(
-            row.method, (max(row.us_per_contact.values()), max(row.rms_mm, MIN_SHOWN_MM)),
-            xytext=(1.015, height), textcoords="axes fraction", fontsize=8, va="center",
-            color=COLOURS[row.kind], weight="bold" if row.kind == "core" else "normal",
-            arrowprops={"arrowstyle": "-", "lw": 0.5, "color": COLOURS[row.kind], "alpha": 0.6},
-            annotation_clip=False,
-        )  # fmt: skip
-
-
-def findings(cases: Sequence[Case], rows: Sequence[Row]) -> list[str]:
-    """Return what the figures say of core and exact inverse, beside the alternatives."""
-    by = {(row.case, row.method): row for row in rows}
-    best, fit = by["ideal pad", "exact inverse"], by["ideal pad", "least_squares, eqs. 4-5"]
-    one = {name: by["gaps and resistors", name] for name in ("core, new contacts", "core, tracked contacts")}
-    rival = by["gaps and resistors", "least_squares, exact field"]
-    new, tracked = one.values()
-    default, floors = by["world default", "core, new contacts"], cases[-1].floors_mm
-    least, noise = floors.values()
-    side_mm, each = min(LENGTH_MM, WIDTH_MM), best.us_per_contact.get("bulk", np.nan)
-    return [
-        f"* Core, 15 contacts in a call: {15 * new.us_per_contact['15']:.3g} us if new, "
-        f"{15 * tracked.us_per_contact['15']:.3g} us if tracked; least_squares on the same field takes "
-        f"{rival.us_per_contact['1'] / new.us_per_contact['15']:.0f} times as long as for new ones.",
-        f"* Exact inverse on the ideal pad: worst error {best.worst_mm / side_mm:.0e} of a side, {each:.2g} "
-        f"us each in bulk, {fit.us_per_contact['15'] / each:.0f} times faster than "
-        f"least_squares on the paper's sums (worst error {fit.worst_mm / side_mm:.0e}).",
-        f"* World `default`: rms error of the core {default.rms_mm:.2g} mm, of an oracle {least:.2g} "
-        f"mm, from noise alone {noise:.2g} mm. There calibration matters more than "
-        "the method, as long as it models gaps and resistors.",
-    ]
-
-
-HEAD = """\
-A plane pad of {length:g} x {width:g} mm. *Ideal*: no gaps, no resistors; *gaps and resistors*: {gap:g} mm
-bare at each end of an electrode, {ohm:g} ohm in series with each, all known; both without noise, exact
-currents, and so the error is the method's own. *World default*: the same file, {pads} pads drawn for a
-seed of the reporting family, {low:g} to {high:g} N, simulated by finite elements with noise and
-quantisation: nothing that was drawn is known. All errors are of contacts 5 % of a side and farther from
-the edges; positions off the pad are clipped to it. The paper's ways and the interpolator assume an ideal
-pad.
-
-* Microseconds are processor time per contact, medians; spread: half the distance of quartiles, the
-  largest of the columns. least_squares takes one contact after the other and is timed for up to 15. Core:
-  the daemon's stages ({compiled}), with covariance and place on the link, in calls of {core} contacts at
-  most; *tracked*: from the last position, 0.1 mm away. Bulk: {bulk} contacts.
-* Green lines: rms of the least error by noise (Cramer-Rao, at {total:g} mA), and of an oracle that knows
-  the distributions of all tolerances, but no values. In the shaded area an error doesn't matter.
-  Formulations of the exact inverse that were rejected are in [formulations](formulations.md)."""
 
 
 def main() -> None:
@@ -385,37 +445,13 @@ def main() -> None:
         exact_case("gaps and resistors", BUILT, count),
         world_case(BUILT, 2 if quick else WORLD_PADS, 5 if quick else WORLD_TOUCHES),
     ]
-    rows = measure(cases, quick)
-    compiled = "compiled" if solve.__file__.endswith(".so") else "NOT compiled"
-    machine = (
-        f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy "
-        f"{np.__version__}, scipy {scipy.__version__}; load average {os.getloadavg()[0]:.1f}"
+    report = Report(
+        quick, contacts=[case.currents.shape[1] for case in cases], compiled=solve.__file__.endswith(".so")
     )
-    head = HEAD.format(
-        length=LENGTH_MM, width=WIDTH_MM, gap=BUILT.gap_mm, ohm=BUILT.series_ohm, pads=WORLD_PADS,
-        low=FORCES_N[0], high=FORCES_N[1], compiled=compiled, core=BUILT.model.size, bulk=BULK,
-        total=1e3 * TOTAL_A,
-    )  # fmt: skip
-    page = [
-        "# Run time against error of location",
-        "",
-        f"{made_by()}; {machine}.",
-        "",
-        *findings(cases, rows),
-        "",
-    ]
-    page += ["![run time and error](methods.png)", "", head, ""]
-    for case in cases:
-        page += section(case, rows)
-    out = output_folder(quick)
-    (out / "methods.md").write_text("\n".join(page))
-    record = {
-        "machine": machine,
-        "floors_mm": {case.name: case.floors_mm for case in cases},
-        "rows": [asdict(row) for row in rows],
-    }
-    (out / "methods.json").write_text(json.dumps(record, indent=1) + "\n")
-    draw(cases, rows, out / "methods.png")
+    for name, rows in measure(cases, quick).items():
+        report.table(name.capitalize(), rows)
+    report.table("Floors, mm", [{"case": case.name, **case.floors_mm} for case in cases])
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
-"""`handtouch node` on SocketCAN: time to boot, delay and jitter of samples at SYNC, CPU time, by mode.
+"""`handtouch node` on SocketCAN: time to boot, delay and jitter of samples at SYNC, processor time, by mode.
 
-The real program serves two pads on files that stand in for the kernel's, under tests/socketcan/vcan-run where
-this machine has no vcan0. SYNC comes from the kernel; the frames on the bus give the delay of each TPDO, the
-node's own log the time from SYNC to sample. Writes docs/benchmarks/node.{md,json}.
+The real program with two pads on files that stand in for ADCs, on vcan0, under tests/socketcan/vcan-run where
+this machine has none. Node, ADCs and the sender of SYNC share the processors. SYNC at 200 Hz comes from the
+kernel; a freely running ADC converts at 1000 Hz. TPDOs are timed from the latest SYNC before them, the node's
+own log gives the time from SYNC to sample. *Boot*: from the start of the program to the boot-up message of
+its last node.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import subprocess
@@ -23,8 +24,8 @@ from typing import Any
 import can
 import numpy as np
 
-from benchmarks.bench_latency import ProcessorShare, machine
-from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.page import Report, options, progress
+from benchmarks.served_hand import ProcessorShare
 from handtouch import config
 from handtouch.config import shipped
 from tests.node.stand_in import AdcStandIn, node_text, raw_of_ma
@@ -184,34 +185,12 @@ def main() -> int:
                 boots.append(boot_s(node, bus))
                 rows.append({"sampling": mode, **sample_at_sync(node, bus, asked.seconds)})
             progress(rows[-1])
-    results = {
-        "boot_s": boots,
-        "rows": rows,
-        "way": os.environ.get("VCAN_RUN", "host"),
-        "machine": machine(),
-        "load": os.getloadavg()[0],
-    }
-    out = output_folder(asked.quick)
-    note = (
-        f"SYNC at {SYNC_HZ:g} Hz for {asked.seconds:g} s; a freely running ADC converts at {SCAN_HZ:g} Hz. "
-        "TPDOs are timed from the latest SYNC before them."
+    report = Report(asked.quick, vcan_by=os.environ.get("VCAN_RUN", "host"), seconds_of_a_mode=asked.seconds)
+    report.table(
+        "Boot", [{"starts": len(boots), "median, s": float(np.median(boots)), "worst, s": max(boots)}]
     )
-    lines = [
-        "# `handtouch node`",
-        "",
-        "The real program with two pads on files that stand in for ADCs, on vcan0. Node, ADCs and the sender "
-        f"of SYNC share the processors of {results['machine']} (vcan by the {results['way']}, load "
-        f"{results['load']:.1f}).",
-        "",
-        f"From the start of the program to the boot-up message of its last node: {np.median(boots):.2f} s "
-        f"(median of {len(boots)}, up to {max(boots):.2f} s).",
-        "",
-        *table("Sampling", note, rows),
-        f"{made_by()}.",
-        "",
-    ]
-    (out / "node.md").write_text("\n".join(lines))
-    (out / "node.json").write_text(json.dumps(results, indent=1) + "\n")
+    report.table("Sampling", rows)
+    report.keep()
     return 0
 
 

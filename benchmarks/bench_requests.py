@@ -1,13 +1,12 @@
-"""Processor time that the worst valid requests to the control endpoint take from the daemon's loop.
+"""Worst requests: processor time that the worst valid ones take from the daemon's loop.
 
 The shipped hand, all pads touched, 32 clients with scenes of their own and as many characters as are allowed.
-Each request is handled as the loop does, without the socket; the reply's encoding counts. Writes
-docs/benchmarks/requests.{md,json}.
+Each request is handled as the loop does, without the socket; the reply's encoding counts. Requests take 5 %
+of the loop's time at most, whatever they cost: then they wait.
 """
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,8 +18,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from benchmarks.bench_latency import machine
-from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.page import Report, options
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import MAX_CLIENT_CHARACTERS, MAX_CLIENTS
@@ -79,7 +77,7 @@ def worst_requests(names: list[str], count: int) -> dict[str, list[dict[str, Any
 
 def main() -> None:
     asked = options(__doc__).parse_args()
-    out, repeats = output_folder(asked.quick), QUICK_REPEATS if asked.quick else REPEATS
+    repeats = QUICK_REPEATS if asked.quick else REPEATS
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         deployment = quiet_deployment(Path(folder))
         daemon = HandtouchDaemon.open(deployment, PadModel(deployment), lambda: deployment)
@@ -87,17 +85,12 @@ def main() -> None:
             rows = measure(daemon, deployment.pad_names, repeats)
         finally:
             daemon.close()
-    (out / "requests.json").write_text(json.dumps({"made": made_by(), "rows": rows}, indent=1) + "\n")
-    worst = max(row["99 %, ms"] for row in rows)
-    note = (
-        f"Processor time of the loop, {repeats} requests of each kind, beside scenes of {MAX_CLIENTS} "
-        f"clients with {MAX_CLIENT_CHARACTERS} characters at most; the limit is {LIMIT_MS:g} ms. Requests "
-        "take 5 % of the loop's time at most, whatever they cost: then they wait."
+    report = Report(
+        asked.quick, requests_of_a_kind=repeats, clients=MAX_CLIENTS, characters=MAX_CLIENT_CHARACTERS
     )
-    text = ["# Worst requests", "", f"{made_by()}; {machine()}.", "", *table("Requests", note, rows)]
-    verdict = "within" if worst <= LIMIT_MS else "beyond"
-    text += [f"Of the costliest kind, 99 % took less than {worst:.2f} ms, {verdict} the limit.", ""]
-    (out / "requests.md").write_text("\n".join(text))
+    report.table("Requests", rows)
+    report.limit("99 % of the costliest kind", max(row["99 %, ms"] for row in rows), LIMIT_MS, "ms")
+    report.keep()
 
 
 def measure(daemon: HandtouchDaemon, names: list[str], repeats: int) -> list[dict[str, Any]]:

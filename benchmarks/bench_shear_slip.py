@@ -1,17 +1,21 @@
-"""Measure fingertips with shear pads in MuJoCo's grasps: force vectors, and slip by friction and by position.
+"""Shear pads in grasps: force vectors, and slip by friction and by position.
 
-The daemon's pipeline computes force vectors and percepts of config/utah_mit_shear.toml. Prints its tables and
-writes docs/benchmarks/shear_slip.md and shear_slip.json.
+Grasps as in [percepts of grasps](percept_grasp.md): the hand of `config/utah_mit_shear.toml` closes, squeezes
+twice, and the object is pulled out of it; seeds of the reporting family. The daemon's pipeline computes force
+vectors and percepts of the four fingertips, spherical pads above shear pads, at 200 Hz; MuJoCo's forces are
+the truth. Nothing is calibrated, no pad is tared. Onsets, firm grips and false alarms are defined as there,
+but alarms from 50 ms before an onset on are of it. Delays are those of detected slips, negative before the
+onset; joints are known to 0.2 degrees. *Others*: alarms during motion slower than a slip, or while a grip
+closes. *Force vectors*: tangential forces of contacts with 0.1 N and more, in newton, along and across the
+pad's x, every 0.1 s; those of one grasp are of the same drawn pads.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
-from typing import Any
 
-from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.page import Report, Row, options, progress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -27,7 +31,6 @@ from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.tangential import pad_forces
 
 FloatArray = NDArray[np.float64]
-Row = dict[str, Any]
 KINDS: dict[str, tuple[str, ...]] = {
     "position alone": ("motion",),
     "friction alone": ("friction",),
@@ -87,7 +90,7 @@ def slip_row(world: str, name: str, runs: Sequence[Served], on: Sequence[str]) -
         "world": world,
         "alarms by": name,
         "slips": found["slips"],
-        "detected, %": str(Share(found["detected"], found["slips"])),
+        "detected, %": Share(found["detected"], found["slips"]),
         "delay, ms, 50 %": found["ms"],
         "delay, ms, 95 %": found["ms_95"],
         "before the onset, %": float(100 * before.mean()) if len(before) else np.nan,
@@ -125,37 +128,10 @@ def main() -> None:
             {"world": world, "force": label} | EstimateScore.of_estimates(some).row(bounds=False)
             for label, some in [("all", every), *slices(every, "force")]
         ]
-    page = [
-        "# Shear pads in grasps",
-        "",
-        f"{made_by()}.",
-        "",
-        f"Grasps of {', '.join(objects)}, {seeds} seeds of the reporting family, as in [percepts of "
-        "grasps](percept_grasp.md): the hand of `config/utah_mit_shear.toml` closes, squeezes twice, and the "
-        "object is pulled out of it. The daemon's pipeline computes force vectors and percepts of the four "
-        "fingertips, spherical pads above shear pads, at 200 Hz; MuJoCo's forces are the truth. Nothing is "
-        "calibrated, no pad is tared.",
-        "",
-        *table(
-            "Slip",
-            "Onsets of slips, firm grips and false alarms are defined as in [percepts of "
-            "grasps](percept_grasp.md), "
-            f"but alarms from {1e3 * LEAD_S:.0f} ms before an onset on are of it. Delays are those of "
-            "detected slips, negative before the onset; joints are known to 0.2 degrees. *Others*: alarms "
-            "during motion slower than a slip, or while a grip closes.",
-            slip_rows,
-        ),
-        *table(
-            "Force vectors",
-            f"Tangential forces of contacts with {MIN_NORMAL_N:g} N and more, in newton, along and across "
-            f"the pad's x, every {SCORED_S:g} s; those of one grasp are of the same drawn pads.",
-            force_rows,
-        ),
-    ]
-    folder = output_folder(args.quick)
-    (folder / "shear_slip.md").write_text("\n".join(page))
-    data = {"slip": slip_rows, "forces": force_rows}
-    (folder / "shear_slip.json").write_text(json.dumps(data, indent=1) + "\n")
+    report = Report(args.quick, objects=len(objects), seeds=seeds)
+    report.table("Slip", slip_rows)
+    report.table("Force vectors", force_rows)
+    report.keep()
 
 
 if __name__ == "__main__":

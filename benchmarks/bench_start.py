@@ -1,14 +1,13 @@
-"""Start-up time: to the daemon's first hand frame and to the output of a command, by part.
+"""Start: time to the daemon's first hand frame and to the output of a command.
 
 15 simulated nodes are there, on udp_multicast over loopback, and a subscriber waits for `handtouch run` to
-start: the first hand frame, and the first in which every pad delivers. Again with the files of Python and its
-packages put out of the page cache, as far as the kernel lets go of what others have mapped. Writes
-docs/benchmarks/start.{md,json}.
+start: the first hand frame, and the first in which every pad delivers. Seconds and MB, medians, warm and cold
+alternately; before a cold start the files of Python and its packages are dropped from the page cache, except
+pages mapped by other processes.
 """
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 import shutil
@@ -23,43 +22,25 @@ from typing import Any
 
 import zmq
 
-from benchmarks.bench_latency import (
+from benchmarks.page import Report, options
+from benchmarks.served_hand import (
     PATHS,
     PORT,
     film,
     in_own_network,
-    machine,
     nodes,
     on_loopback,
+    processor_s,
     resident_mb,
 )
-from benchmarks.page import made_by, options, output_folder
 from handtouch import wire
 from handtouch.config import load
 from handtouch.daemon.table_cache import cache_path
 
-AIMS_S = {"first frame": 1.0, "first frame, no tables": 2.0, "help": 0.3}
-AIM_MB = 120.0
-STEPS = """
-import sys, time
-from pathlib import Path
-start = time.perf_counter()
-times = []
-def lap(name):
-    global start
-    now = time.perf_counter(); times.append((name, now - start)); start = now
-import numpy; lap("numpy")
-import can, canopen; lap("python-can and canopen")
-import pydantic; lap("pydantic")
-from handtouch.core.pad_model import PadModel
-from handtouch.daemon.table_cache import build_pad_model
-import handtouch.daemon.serve as d; lap("other imports of the daemon")
-deployment = d.load(Path(sys.argv[1])); lap("reading the deployment")
-PadModel(deployment); lap("model of the pads, tables computed")
-model = build_pad_model(deployment); lap("model of the pads, tables cached")
-daemon = d.HandtouchDaemon.open(deployment, model); lap("opening endpoints and buses")
-for name, took in times: print(f"{took} {name}")
-"""
+AIMS = (
+    ("first", "first frame", 1.0, "s"), ("no tables", "first frame", 2.0, "s"),
+    ("first", "memory", 120.0, "MB"), ("help", "help", 0.3, "s"),
+)  # fmt: skip
 
 
 def forget_files() -> None:
@@ -74,12 +55,6 @@ def forget_files() -> None:
                     continue
                 os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
                 os.close(descriptor)
-
-
-def processor_s(pid: int) -> float:
-    """Return the CPU time of a process so far, user and system, all threads, without children."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def first_frames(config: Path) -> dict[str, float]:
@@ -123,15 +98,6 @@ def help_once() -> dict[str, float]:
     return {"help": took_s, "help, processor": used}
 
 
-def steps(config: Path) -> dict[str, float]:
-    """Return the seconds of each part of the start, without booting nodes."""
-    done = subprocess.run(
-        [sys.executable, "-c", STEPS, str(config)], check=True, capture_output=True, text=True
-    )
-    rows = [line.split(" ", 1) for line in done.stdout.splitlines()]
-    return {name: float(took) for took, name in rows}
-
-
 def medians(rows: list[dict[str, float]]) -> dict[str, float]:
     """Return the median of each value."""
     return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
@@ -148,7 +114,6 @@ def measure(config: Path, runs: int) -> dict[str, Any]:
         "no tables": first_without_tables,
         "first": lambda: first_frames(config),
         "help": help_once,
-        "steps": lambda: steps(config),
     }
     found: dict[str, dict[str, list[dict[str, float]]]] = {
         cache: {name: [] for name in once} for cache in ("warm", "cold")
@@ -161,58 +126,6 @@ def measure(config: Path, runs: int) -> dict[str, Any]:
                 rows[name].append(measured())
                 print(cache, rows[name][-1], flush=True)
     return {cache: {name: medians(rows[name]) for name in once} for cache, rows in found.items()}
-
-
-def write(results: dict[str, Any], out: Path) -> str:
-    """Return the page."""
-    warm, cold = (
-        {
-            **results[cache]["first"],
-            **results[cache]["help"],
-            "first frame, no tables": results[cache]["no tables"]["first frame"],
-        }
-        for cache in ("warm", "cold")
-    )
-    titles = {
-        "first frame": "`handtouch run` to the first hand frame at a subscriber",
-        "first frame, no tables": "the same without cached tables of the pads",
-        "processor": "CPU time of the daemon until then, user and system",
-        "all pads": "to the first with samples of all pads",
-        "help": "`handtouch --help`",
-        "help, processor": "its CPU time",
-    }
-    rows = "\n".join(
-        f"| {text} | {warm[name]:.2f} | {cold[name]:.2f} | {AIMS_S.get(name, '')} |"
-        for name, text in titles.items()
-    )
-    parts = "\n".join(
-        f"| {name} | {took:.2f} | {results['cold']['steps'][name]:.2f} |"
-        for name, took in results["warm"]["steps"].items()
-    )
-    text = f"""# Start
-
-15 simulated nodes run on udp_multicast over loopback. Seconds, medians of {results["runs"]} runs,
-warm and cold alternately; before a cold start the files of Python and its packages are dropped from the page
-cache, except pages mapped by other processes. {results["machine"]};
-load average when it ended {results["load"]:.1f}.
-
-| | warm | cold | aim |
-| --- | --- | --- | --- |
-{rows}
-
-Resident memory of the daemon with all pads: {warm["memory"]:.0f} MB (aim {AIM_MB:.0f}).
-
-By part, before the boot of the nodes:
-
-| | warm | cold |
-| --- | --- | --- |
-{parts}
-
-{made_by()}.
-"""
-    (out / "start.md").write_text(text)
-    (out / "start.json").write_text(json.dumps(results, indent=1) + "\n")
-    return text
 
 
 def main() -> int:
@@ -232,20 +145,16 @@ def main() -> int:
         results = measure(config, asked.runs)
         stop.set()
         worker.join()
-    results |= {"runs": asked.runs, "machine": machine(), "load": os.getloadavg()[0]}
-    print(write(results, output_folder(asked.quick)))
-    return int(
-        not asked.quick
-        and any(
-            results["warm"][key][name] > aim
-            for key, name, aim in (
-                ("first", "first frame", AIMS_S["first frame"]),
-                ("no tables", "first frame", AIMS_S["first frame, no tables"]),
-                ("first", "memory", AIM_MB),
-                ("help", "help", AIMS_S["help"]),
-            )
-        )
-    )
+    report = Report(asked.quick, runs=asked.runs)
+    rows = [
+        {"case": f"{case}: {name}", **{cache: of[case][name] for cache, of in results.items()}}
+        for case in ("first", "no tables", "help")
+        for name in results["warm"][case]
+    ]
+    report.table("Start", rows)
+    for case, name, aim, unit in AIMS:
+        report.limit(f"{case}: {name}, warm", results["warm"][case][name], aim, unit)
+    return int(not report.keep() and not asked.quick)
 
 
 if __name__ == "__main__":

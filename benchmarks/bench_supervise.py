@@ -1,42 +1,64 @@
-"""Measure the effect of baseline tracking and sheet force compensation.
+"""Baseline and sheet force compensation: what a held object, slow presses and hours of use show.
 
-Drift and sheets are those of the worlds `ideal`, `default` and `harsh`, seeds of the reporting family; the
-daemon knows what the deployment file states of them. Two processes share the work. Writes
-docs/benchmarks/supervise.{md,json,png}; `--quick` tries it out in some minutes and writes nothing. Costs
-are in bench_tick.
+Drift and sheets are those of the [worlds](../worlds.md), seeds of the reporting family; the daemon knows what
+the deployment file states of them. Two processes share the work. Costs are in [tick](tick.md).
+
+*Held object*: five pads of fifteen hold something while zeros, temperature and supply drift as in each world.
+The error is that of the force at the end against the same grip at its start; below, without parts of the
+compensation. *A hand that gets warm*: 8 K more within some minutes, and back 12 minutes later, with the same
+grip held for 25. The other pads are touched lightly, with twice the current of the threshold, before and
+while it is warm. Channels drift by 2 counts/K (rms), a part of it common to all. Errors are against the
+grip's first seconds, and against the touch before. *Turned over*: four times a minute, untouched for ten
+minutes and then with the same grip for ten; each channel reads 4 counts (rms) more for a unit of gravity
+along each axis of its link. *Slow presses*: on a pad of the shipped hand, begin_threshold_n 0.06 N,
+max_rise_time_s 20.
+
+*Mixed use*: sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and of the paper's
+two: grips of 2 to 40 s, some of minutes, half of them waxing and waning, and breaks. The deployment file
+describes sheets as their builder would; contact layers differ as in the world. Contacts are given their load:
+errors of position, currents and radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the
+paper's are there exactly as in the file, one seed. One reading of each contact, at a random age. Errors rms
+of valid forces; *ratio*: compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation
+of the file instead of learned ones. *By pad*: with the interval of the scatter between pads, as readings of
+one pad share gain and parameters. *Width* of the stated 95 % interval. *All* are the world's own kinds, also
+by age of the contact. *Effect of the parts*: the first seed in `default`, its own kinds, a third of the time.
+*Sheets that weren't measured*: the same with `preset = "unknown"`, which hold one object again and again,
+compared at the end of each hold; `force_status` is `valid` after three contacts. A day of the same use is in
+[soak_sheets](soak_sheets.md).
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, replace
-from itertools import pairwise
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.page import made_by, options, output_folder, progress
-from benchmarks.scores import Estimates, EstimateScore, Share, concatenate, slices
-from benchmarks.sheet_hours import (
+from benchmarks.page import Report, Rows, options, progress
+from benchmarks.scores import Estimates, Share, concatenate, slices
+from benchmarks.sheet_use import (
     COMPLETE,
     CUTS,
+    FULL_N,
+    HOUR_S,
     PADS,
     SEEDS,
     UNLEARNED,
+    Holds,
+    drawn_sheets,
     force_row,
     kinds_of,
     of_kinds,
     rms,
+    score_use,
     used,
 )
-from benchmarks.sheet_use import FULL_N, HOUR_S, Holds, drawn_sheets, score_use
-from handtouch.config import Behaviour, load, shipped
+from benchmarks.touched_pads import hands
+from handtouch.config import Behaviour
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
@@ -45,11 +67,7 @@ from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.worlds import WORLDS, Family
 from tests.exact_pads import ExactNetworks
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
 FloatArray = NDArray[np.float64]
-Rows = list[dict[str, Any]]
 PERIOD_NS = 100_000_000
 DRIFTS = {name: world.only("electronics").draw(Family.REPORTING.seed(71)) for name, world in WORLDS.items()}
 SPAN_S = 60.0  # of drift that is drawn at once
@@ -59,15 +77,6 @@ HOLDS = (1, 2, 4, 8)
 DAY, PARTS = "Mixed use of sheets", "Effect of the parts"
 UNKNOWN = "Sheets that weren't measured"
 WARM, TURNED = "A hand that gets warm", "A hand that is turned over"
-INK, FAINT, ACCENT, RED = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c23b22"
-
-
-def hands(count: int) -> PadModel:
-    """The shipped hand, that often."""
-    deployment = load(shipped.path("utah_mit.toml"))
-    (hand,) = deployment.hands
-    many = tuple(hand.model_copy(update={"name": f"hand{k}"}) for k in range(count))
-    return PadModel(deployment.model_copy(update={"hands": many}))
 
 
 class Rig:
@@ -125,34 +134,17 @@ def without_following(tick: TickProcessor) -> None:
     baseline.update_baseline = still  # type: ignore[method-assign]
 
 
-def without_gate(tick: TickProcessor) -> None:
-    """Baselines follow in contact too."""
-    baseline, learn, state = tick.baseline, tick.baseline.update_baseline, tick.state
-
-    def ungated(sync_ns: int, touching: NDArray[np.bool_]) -> bool:
-        rows = np.flatnonzero(touching)
-        excess = tick.counts[rows] - baseline.expected_counts[rows]
-        state.block_sum[rows] += excess
-        state.block_squares[rows] += np.square(excess)
-        state.block_count[rows] += 1
-        baseline.held[:] = False
-        return learn(sync_ns, touching & False)
-
-    baseline.update_baseline = ungated  # type: ignore[method-assign]
-
-
 HALVES: dict[str, Callable[[TickProcessor], None]] = {
     "all compensation": lambda _: None,
     "without the common mode": without_common,
     "followed for a minute only": without_following,
     "without any baseline": without_baseline,
-    "followed in contact too": without_gate,
 }
 
 
 def held(world: str, name: str, seconds: float) -> Rows:
     """An object held in five pads of fifteen: forces at the end against those at the start."""
-    rig = Rig(hands(1), 71, world)
+    rig = Rig(hands(15), 71, world)
     HALVES[name](rig.tick)
     none = np.zeros(rig.model.size)
     grip = grips(rig.model)
@@ -175,7 +167,7 @@ def held(world: str, name: str, seconds: float) -> Rows:
     return [
         {
             "world": world,
-            "": name,
+            "case": name,
             "force error, worst of five": f"{100 * float(np.abs(off).max()):.2f} %",
             "rms": f"{100 * float(np.sqrt(np.mean(off**2))):.2f} %",
             "contacts ever lost, of five": len(lost),
@@ -222,7 +214,7 @@ def follow(rig: Rig, seconds: float, zero: Callable[[float], FloatArray]) -> dic
 
 def warm(alike: float, name: str) -> Rows:
     """8 K more within minutes, and back; channels drift by 2 counts/K rms, `alike` of it in common."""
-    rig, rng = Rig(hands(1), 74), np.random.default_rng(74)
+    rig, rng = Rig(hands(15), 74), np.random.default_rng(74)
     HALVES[name](rig.tick)
     own = rng.normal(size=(rig.model.size, 4))
     own *= np.sqrt((1 - alike**2) / np.mean(own**2))
@@ -232,12 +224,12 @@ def warm(alike: float, name: str) -> Rows:
         warmth = 8 * (-np.expm1(-max(t_s - 180, 0) / 180) + np.expm1(-max(t_s - 900, 0) / 180))
         return np.asarray(per_k * warmth)
 
-    return [{"in common": f"{100 * alike:.0f} %", "": name, **follow(rig, 1500, zero)}]
+    return [{"in common": f"{100 * alike:.0f} %", "case": name, **follow(rig, 1500, zero)}]
 
 
 def turned(known: bool) -> Rows:
     """Turned over every quarter of a minute or so; gravity causes 4 counts rms along each axis."""
-    rig, rng = Rig(hands(1), 75), np.random.default_rng(75)
+    rig, rng = Rig(hands(15), 75), np.random.default_rng(75)
     by_gravity = rng.normal(0, 4.0, (rig.model.size, 4, 3))
     ways, speeds = rng.normal(size=(2, 3)), np.array([0.21, 0.34, 0.55])
 
@@ -261,7 +253,7 @@ def slow(quick: bool) -> Rows:
     """A press that grows at a steady speed: where it is found, and what the baseline has taken of it."""
     rows = []
     for speed in (3e-3, 1e-2, 1e-1) if quick else (3e-4, 1e-3, 3e-3, 1e-2, 1e-1):
-        rig = Rig(hands(1), 72)
+        rig = Rig(hands(15), 72)
         model = rig.model
         per_law = (
             model.begin_threshold_counts[0] / model.begin_threshold_n[0] ** 1.5
@@ -285,7 +277,6 @@ def slow(quick: bool) -> Rows:
                 "part of its current taken for baseline, at 0.3 N": f"{100 * taken:.1f} %",
             }
         )
-        print(rows[-1], flush=True)
     return rows
 
 
@@ -317,7 +308,7 @@ def unknown_rows(every: Estimates) -> Rows:
                     "pads": len(some),
                     "uncompensated, N": rms(some.columns["uncompensated"]),
                     "compensated, N": rms(some.error),
-                    "in 95 %": str(Share.of_mask(some.distances() <= 1.96)),
+                    "in 95 %": Share.of_mask(some.distances() <= 1.96),
                     "median width, N": float(np.median(width)),
                     "valid, %": f"{100 * some.valid.mean():.0f}",
                 }
@@ -325,99 +316,7 @@ def unknown_rows(every: Estimates) -> Rows:
     return rows
 
 
-def by_hour(some: Estimates) -> list[list[float]]:
-    """Return hour and rms of errors without and with compensation, and of the stated deviation."""
-    good = some.where(some.valid)
-    hour, found = good.columns["hour"], []
-    for low, high in pairwise(np.linspace(0, math.ceil(hour.max()), 17)):
-        on = (hour >= low) & (hour < high)
-        if on.any():
-            parts = (good.columns["uncompensated"][on], good.error[on, 0], np.sqrt(good.covariance[on, 0, 0]))
-            found.append([float(low), *(rms(part) for part in parts)])
-    return found
-
-
 # The page
-
-
-def draw(curves: dict[str, list[list[float]]], presses: Rows, path: Path) -> None:
-    figure, axes = plt.subplots(1, 3, figsize=(14, 4.4), layout="constrained")
-    for axis, (world, curve) in zip(axes, curves.items(), strict=False):
-        hour, raw, off, std = np.array(curve).T
-        axis.plot(hour, raw, color=FAINT, label="uncompensated")
-        axis.plot(hour, off, color=ACCENT, label="compensated")
-        axis.plot(hour, std, color=RED, ls="--", label="stated")
-        axis.set(title=f"world {world}: mixed use", xlabel="hour", ylabel="force error, rms, N")
-        axis.set_ylim(0, None)
-        axis.legend(frameon=False)
-    speed = [row["speed, N/s"] for row in presses]
-    detected_n = [row["found at, N"] for row in presses]
-    axes[2].plot(speed, [math.nan if newton is None else newton for newton in detected_n], "o-", color=ACCENT)
-    axes[2].axhline(0.06, color=FAINT, lw=0.8)
-    axes[2].text(speed[-1], 0.0615, "begin_threshold_n", ha="right", va="bottom", color=FAINT)
-    axes[2].set(title="Slow presses", xscale="log", xlabel="speed of the press, N/s", ylabel="found at, N")
-    axes[2].set_ylim(0, None)
-    figure.savefig(path, dpi=110)
-
-
-def table(rows: Rows) -> list[str]:
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + " --- |" * len(rows[0])]
-    for row in rows:
-        cells = [
-            "none" if cell is None else f"{cell:.3g}" if isinstance(cell, float) else str(cell)
-            for cell in row.values()
-        ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
-
-
-def notes(hours: float, held_s: float) -> dict[str, str]:
-    return {
-        "Held object": f"""Five pads of fifteen hold something for {held_s:g} s, while zeros, temperature and
-supply drift as in each [world](../worlds.md). The error is that of the force at the end against the same grip
-at its start; below, without parts of the compensation. With so slow a drift it matters only that it isn't
-tracked in contact; the next two sections show the effect of the other parts.""",
-        WARM: """8 K more within some minutes, and back 12 minutes later, with the same grip held for 25. The
-other pads are touched lightly, with twice the current of the threshold, before and while it is warm. Channels
-drift by 2 counts/K (rms), a part of it common to all, as with amplifiers of one type on one supply.
-Errors are against the grip's first seconds, and against the touch before.""",
-        TURNED: """The whole hand is turned over four times a minute, untouched for ten minutes and then
-with the same grip for ten. Each channel reads 4 counts (rms) more for a unit of gravity along each axis of
-its link.""",
-        "Slow presses": "On a pad of the shipped hand, begin_threshold_n 0.06 N, max_rise_time_s 20.",
-        DAY: f"""{PADS} sheets of each [kind](../worlds.md#kinds-of-sheets) of the reporting family and of
-the paper's two, for {hours:g} h, {len(SEEDS)} seeds: grips of 2 to 40 s, some of minutes, 0.1 to
-{FULL_N:g} N, half of them waxing and waning, and breaks. The deployment file describes sheets as their
-builder would; contact layers differ as in the world. Contacts are given their load: errors of position,
-currents and radius are in [worlds](worlds.md). In `ideal` sheets have no behaviour; the paper's are there
-exactly as in the file, one seed. One reading of each contact, at a random age. Errors rms of valid forces;
-*ratio*: compensated over uncompensated; *nothing learned*: same seeds, creep and adaptation of the file
-instead of learned ones, which is what handtouch compensated before it learned any. *In 95 %*: share of
-readings within the stated interval, with the 95 % interval of a binomial count; *by pad*: with that of the
-scatter between pads, as readings of one pad share gain and parameters. *Width* of the stated 95 % interval.
-*All* are the world's own kinds, also by age of the contact. A day of the same use is in
-[soak_sheets](soak_sheets.md).""",
-        PARTS: "The first seed in `default`, its own kinds, without some parts; a third of the time.",
-        UNKNOWN: f"""The same sheets, all with `preset = "unknown"`, which hold one object of
-{Holds.HELD_N:g} N again and again, {Holds.HELD_S:g} s each time, compared at the end of each hold. What is
-learned is whether and how fast they adapt and creep, most of it in the first hold. Gain, hysteresis and the
-scatter between presses, which are most of the width, can't be learned from use;
-[force references](../supervise.md#force-on-sheets-that-creep-and-adapt) narrow that of the gain. The more a
-sheet has adapted, the wider the interval. `force_status` is `valid` after three contacts.""",
-    }
-
-
-def page(parts: dict[str, Rows], hours: float, held_s: float) -> str:
-    lines = [
-        "# Baseline and sheet force compensation",
-        "",
-        "![mixed use of sheets, slow presses](supervise.png)",
-        "",
-    ]
-    texts = notes(hours, held_s)
-    for title, rows in parts.items():
-        lines += [f"## {title}", "", texts[title], "", *table(rows), ""]
-    return "\n".join([*lines, f"{made_by()}.", ""])
 
 
 def force_tables(found: dict[tuple[str, str], Estimates]) -> tuple[Rows, Rows]:
@@ -475,15 +374,12 @@ def main() -> None:
             progress(f"{title}: {parts[title][-1]}")
     parts[DAY], parts[PARTS] = force_tables(found)
     parts[UNKNOWN] = unknown_rows(concatenate([future.result() for future in not_measured]))
-    text = page(parts, hours, held_s)
-    print(text)
-    out = output_folder(quick)
-    curves = {world: by_hour(of_kinds(world, found[world, COMPLETE])) for world in ("default", "harsh")}
-    (out / "supervise.md").write_text(text)
-    scores = {", ".join(key): asdict(EstimateScore.of_estimates(some)) for key, some in found.items()}
-    record = json.dumps({**parts, "curves": curves, "scores": scores}, indent=1).replace("NaN", "null")
-    (out / "supervise.json").write_text(record + "\n")
-    draw(curves, parts["Slow presses"], out / "supervise.png")
+    report = Report(
+        quick, sheets_of_a_kind=pads, hours_of_mixed_use=hours, held_for_s=held_s, greatest_force_n=FULL_N
+    )
+    for title, found_rows in parts.items():
+        report.table(title, found_rows)
+    report.keep()
 
 
 if __name__ == "__main__":

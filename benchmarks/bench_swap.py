@@ -1,27 +1,26 @@
-"""Position error of a replaced node by number of contacts since, in the worlds `ideal`, `default`, `harsh`.
+"""Position after a node replacement: by number of contacts since, in three worlds.
 
-The supervisor worker calibrates the gains of nodes it doesn't know. Prints its table and writes
-docs/benchmarks/swap.{md,json,png}; with --quick it only prints.
+The supervisor worker receives blocks of ticks as from the daemon, of nodes of each shape (20 x 20 and 36 x 20
+mm), each a replacement without a stored calibration, in each [world](../worlds.md) for a seed of the
+reporting family. What a world draws is hidden from the worker: gains, gaps, resistors, sizes of contacts,
+sheets, drift; pads are mounted as stated. Contacts of 0.5 to 5 N anywhere, 12 samples each; 100 others a pad,
+single samples, measure the error. A node is calibrated once its least certain log gain is known to 2 %, after
+32 contacts at least.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import platform
 import tempfile
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import msgpack
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
-from benchmarks.page import made_by, options, output_folder, progress
+from benchmarks.page import Report, options, progress
 from benchmarks.scores import Share
 from handtouch import config
 from handtouch.calibration.store_client import StoreClient
@@ -42,12 +41,8 @@ from handtouch.supervisor.worker import SupervisorWorker
 from tests.deployments import deployment_text, pad_text
 from tests.exact_pads import ExactPads
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
 FloatArray = NDArray[np.float64]
 
-ROOT = Path(__file__).parent.parent
 SHAPES = {"1:1": 20.0, "1.8:1": 36.0}
 WIDTH_MM = 20.0
 UNITS = 6
@@ -196,74 +191,23 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
                     "position error, rms mm": float(np.sqrt(np.mean(error[own] ** 2))),
                     "95 % below, mm": float(np.quantile(error[own], 0.95)),
                     "with the true gains, rms mm": float(np.sqrt(np.mean(least[own] ** 2))),
-                    "calibrated, %": str(Share(state[own].count("calibrated"), units)),
-                    "stated std of the gains, %": _percent(float(np.mean(std[own]))),
+                    "calibrated, %": Share(state[own].count("calibrated"), units),
+                    "stated std of the gains, %": 100 * float(np.mean(std[own])),
                 }
             )
     return rows
 
 
-def _percent(part: float) -> float | None:
-    """None before anything is known."""
-    return 100 * part if np.isfinite(part) else None
-
-
-def draw(path: Path, rows: list[dict[str, Any]]) -> None:
-    figure, panels = plt.subplots(1, len(WORLDS), figsize=(14, 4.4), layout="constrained", sharey=True)
-    for axes, world in zip(panels, WORLDS, strict=True):
-        for shape in SHAPES:
-            own = [row for row in rows if (row["world"], row["pad"]) == (world, shape)]
-            at = [row["contacts since"] for row in own]
-            (line,) = axes.plot(at, [row["position error, rms mm"] for row in own], "o-", label=shape)
-            axes.plot(at, [row["95 % below, mm"] for row in own], "^:", color=line.get_color(), alpha=0.5)
-            least = own[0]["with the true gains, rms mm"]
-            axes.axhline(least, color=line.get_color(), ls="--", lw=1, label=f"{shape}, with the true gains")
-        axes.set(xlabel="contacts since the replacement", yscale="log", title=f"world {world}")
-        axes.legend(fontsize=8)
-    panels[0].set_ylabel("position error, mm: rms (solid), 95 % below (dotted)")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def main() -> None:
     quick = options(__doc__).parse_args().quick
     units, counts = (1, COUNTS[:3]) if quick else (UNITS, COUNTS)
-    machine = (
-        f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, "
-        f"numpy {np.__version__}, scipy {scipy.__version__}"
-    )
     rows = []
     for name in WORLDS:
         rows += run(name, units, counts)
         progress(f"world {name}: {units} nodes of each shape")
-    cells = [
-        [f"{v:.3g}" if isinstance(v, float) else "" if v is None else str(v) for v in row.values()]
-        for row in rows
-    ]
-    table = [f"| {' | '.join(line)} |" for line in (list(rows[0]), ["---"] * len(rows[0]), *cells)]
-    print("\n".join(table))
-    lines = [
-        "# After a node replacement",
-        "",
-        f"{made_by()}; {machine}.",
-        "",
-        "The supervisor worker receives blocks of ticks as from the daemon, of "
-        f"{units} nodes of each shape ({' and '.join(f'{x:g} x {WIDTH_MM:g} mm' for x in SHAPES.values())}), "
-        "each a replacement without a stored calibration, in each [world](../worlds.md) for a seed of the "
-        "reporting family. What a world draws is hidden from the worker: gains, gaps, resistors, sizes of "
-        f"contacts, sheets, drift. Contacts of 0.5 to 5 N anywhere, {TICKS} samples each; 100 others a pad, "
-        "single samples, measure the error. A node is calibrated once its least certain log gain is known to "
-        "2 %, after 32 contacts at least; shares with 95 % intervals.",
-        "",
-        *table,
-        "",
-        "![swap](swap.png)",
-        "",
-    ]
-    out = output_folder(quick)
-    (out / "swap.md").write_text("\n".join(lines))
-    (out / "swap.json").write_text(json.dumps({"machine": machine, "rows": rows}, indent=1) + "\n")
-    draw(out / "swap.png", rows)
+    report = Report(quick, nodes_of_a_shape=units)
+    report.table("Errors", rows)
+    report.keep()
 
 
 if __name__ == "__main__":

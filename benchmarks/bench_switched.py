@@ -1,15 +1,17 @@
-"""Measure contacts on a pad whose node switches its electrodes, still and moving, and two at once.
+"""Contacts on a pad with switched electrodes: still and moving, and two at once.
 
-The pads of config/switched.toml, a tip of eight electrodes on four channels and a phalanx of the same size
-and four whole sides, with hidden quantities drawn in the world `default` for seeds of the reporting family,
-on ideal sheets. Touches that stand or slide go through the daemon's own pipeline, states sampled in turn; one
-sample of each is compared. Prints its tables and writes docs/benchmarks/switched.md and switched.json.
+Fingers of [switched.toml](../../config/switched.toml) with hidden quantities drawn in the
+[world](../worlds.md) `default`, seeds of the reporting family, on sheets without creep and hysteresis, at 100
+Hz; touches of 0.3 to 6 N (log-uniform) that stand anywhere on the pad or slide along straight paths, through
+the daemon's own pipeline. The tip has eight electrodes, four of them connected in each SYNC period; the
+phalanx beside it, of the same size and sheet, four whole sides, which can't report two contacts. One sample
+of each touch, in the middle of its path; `unreliable` positions have a wider region too. Pairs: at rest on
+the switched pad, 0.3 to 3 N each, at a false-alarm rate of 0.1 %. Intervals are of fingers: contacts of one
+pad share its parts.
 """
 
 from __future__ import annotations
 
-import itertools
-import json
 import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -20,10 +22,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.bench_electrodes import PlayedPair, compare_pair, pair_rows, share_of
 from benchmarks.bench_worlds import drawn_world, with_stated_touches
 from benchmarks.hand_touches import REST_S, STEP_S, TOUCH_S, serve, tangent_basis
-from benchmarks.page import made_by, options, output_folder, table
-from benchmarks.scores import ClusterShare
+from benchmarks.page import Report, options
+from benchmarks.scores import Share
 from handtouch import wire
 from handtouch.config import Pad, load, shipped
 from handtouch.core.pad_model import PadModel
@@ -56,23 +59,13 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Distance [mm] of two contacts at once, and of each reported one, error [mm] and squared deviation."""
-
-    finger: int
-    distance_mm: float
-    errors_mm: tuple[float, ...] = ()
-    squares: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True)
 class Played:
     """Samples of one finger; `touches`: number played of each key; `false_pairs`: single ones reported as
     two."""
 
     samples: dict[Key, list[Sample]]
     touches: int
-    pairs: list[Pair]
+    pairs: list[PlayedPair]
     false_pairs: int
 
 
@@ -170,29 +163,9 @@ def compare(finger: int, contact: wire.Contact, truth: GroundTruth) -> Sample:
     )
 
 
-def compare_pair(finger: int, contact: wire.Contact | None, truths: list[GroundTruth]) -> Pair:
-    """Compare two reported contacts with the true ones that they are nearer to."""
-    true_m = np.array([truth.position_m for truth in truths])
-    distance_mm = 1e3 * float(np.linalg.norm(true_m[1] - true_m[0]))
-    if contact is None or not contact.parts:
-        return Pair(finger, distance_mm)
-    at = np.array([part["position_m"] for part in contact.parts])
-    kept, crossed = (np.linalg.norm(at - true_m[order], axis=1).sum() for order in ([0, 1], [1, 0]))
-    errors, squares = [], []
-    for part, true in zip(contact.parts, true_m if kept <= crossed else true_m[::-1], strict=True):
-        across = tangent_basis(np.array(part["normal"]))
-        error = across @ np.subtract(part["position_m"], true)
-        on_pad = np.subtract(part["covariance_m2"], contact.mount_covariance_m2 or 0.0)
-        covariance = across @ on_pad.reshape(3, 3) @ across.T
-        errors.append(1e3 * float(np.linalg.norm(error)))
-        squares.append(float(error @ np.linalg.solve(covariance, error)))
-    return Pair(finger, distance_mm, tuple(errors), tuple(squares))
-
-
-def share_of(hits: Any, fingers: Any) -> str:
-    """Return a share with the interval that the scatter between fingers gives, - for fewer than two."""
-    hits, fingers = np.asarray(hits, np.bool_), np.asarray(fingers)
-    return str(ClusterShare.of_mask(hits, fingers)) if len(np.unique(fingers)) > 1 else "-"
+def in_region(some: list[Sample]) -> Any:
+    """Return the share of samples within their 95 % region."""
+    return share_of(np.array([one.square < 5.991 for one in some]), np.array([one.finger for one in some]))
 
 
 def single_rows(played: list[Played]) -> list[dict[str, Any]]:
@@ -210,38 +183,10 @@ def single_rows(played: list[Played]) -> list[dict[str, Any]]:
                     "valid, %": f"{100 * len(valid) / sum(one.touches for one in played):.0f}",
                     "median error, mm": f"{np.median([one.error_mm for one in some]):.3f}",
                     "median std, mm": f"{np.median([one.std_mm for one in some]):.3f}",
-                    "valid in 95 %": share_of(
-                        [one.square < 5.991 for one in valid], [one.finger for one in valid]
-                    ),
-                    "located in 95 %": share_of(
-                        [one.square < 5.991 for one in some], [one.finger for one in some]
-                    ),
+                    "valid in 95 %": in_region(valid),
+                    "located in 95 %": in_region(some),
                 }
             )
-    return rows
-
-
-def pair_rows(pairs: list[Pair]) -> list[dict[str, Any]]:
-    """Return shares of pairs reported, and of these in their regions, by distance."""
-    rows = []
-    limits = (0.0, *DISTANCES_MM, np.inf)
-    for low, high in itertools.pairwise(limits):
-        own = [pair for pair in pairs if low <= pair.distance_mm < high]
-        if not own:
-            continue
-        squares = [(square, pair.finger) for pair in own for square in pair.squares]
-        errors = [error for pair in own for error in pair.errors_mm]
-        rows.append(
-            {
-                "distance, mm": f"{low:g} to {high:g}" if np.isfinite(high) else f"above {low:g}",
-                "pairs": len(own),
-                "reported as two, %": share_of([bool(p.squares) for p in own], [p.finger for p in own]),
-                "positions in 95 %": share_of([s < 5.991 for s, _ in squares], [f for _, f in squares])
-                if squares
-                else "-",
-                "median error, mm": f"{np.median(errors):.2f}" if errors else "-",
-            }
-        )
     return rows
 
 
@@ -256,31 +201,14 @@ def main() -> None:
     with ProcessPoolExecutor(min(asked.fingers, os.cpu_count() or 1)) as pool:
         count = asked.fingers
         played = list(pool.map(play, range(count), [asked.touches] * count, [asked.pairs] * count))
-    page = ["# Contacts on a pad with switched electrodes", "", f"{made_by()}.", ""]
-    page += [HEAD.format(fingers=asked.fingers, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1]), ""]
-    singles, pairs = single_rows(played), pair_rows([pair for one in played for pair in one.pairs])
-    page += table("Single contacts by speed", SINGLES, singles)
-    false = sum(one.false_pairs for one in played)
+    report = Report(asked.quick, fingers=asked.fingers, touches_of_a_pad_and_speed=asked.touches)
+    report.table("Single contacts by speed", single_rows(played))
+    two = [pair for one in played for pair in one.pairs]
+    report.table("Two contacts at once", pair_rows(two, DISTANCES_MM))
     total = sum(len(some) for one in played for (link, _), some in one.samples.items() if link == "tip")
-    page += table("Two contacts at once", PAIRS.format(false=false, total=total), pairs)
-    out = output_folder(asked.quick)
-    (out / "switched.md").write_text("\n".join(page))
-    record = {"singles": singles, "pairs": pairs, "single contacts reported as two": [false, total]}
-    (out / "switched.json").write_text(json.dumps(record, indent=1) + "\n")
-
-
-HEAD = """\
-{fingers} fingers of [switched.toml](../../config/switched.toml) drawn in the [world](../worlds.md) `default`,
-seeds of the reporting family, on sheets without creep and hysteresis, at 100 Hz; {touches} touches of each
-pad and speed, {low:g} to {high:g} N (log-uniform), that stand anywhere on the pad or slide along straight
-paths. The tip has eight electrodes, four of them connected in each SYNC period; the phalanx beside it, of
-the same size and sheet, four whole sides. Both have four channels. Intervals are of fingers: contacts of one
-pad share its parts."""
-SINGLES = """\
-One sample of each touch, in the middle of its path. `unreliable` positions have a wider region too."""
-PAIRS = """\
-Two touches at once on the switched pad, at rest, 0.3 to 3 N each, at a false-alarm rate of 0.1 %; of {total}
-single touches above {false} were reported as two. Four whole sides can't report two at all."""
+    false = Share(sum(one.false_pairs for one in played), total)
+    report.table("Single contacts reported as two", [{"share, %": false}])
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,30 +1,36 @@
-"""Position and force in the worlds `ideal`, `default` and `harsh`: coverage, sharpness and validity.
+"""Position and force by world: coverage, sharpness and validity.
 
-Every hand is the shipped one with hidden quantities drawn for a seed of the reporting family. Touches of any
-force anywhere on its 15 pads go through the daemon's own pipeline, once as configured and again with
-what its automatic calibration found from other touches; one sample of each touch is compared. Writes
-docs/benchmarks/worlds.{md,json,png}.
+Hands of each of the [worlds](../worlds.md) `ideal`, `default` and `harsh`, half as many of each world with
+few hidden quantities; 15 pads each, of four surfaces; seeds of the reporting family. Touches of each pad, 0.2
+to 12 N (log-uniform), anywhere from 2 % of a side inside the edges, go through the daemon's own pipeline; one
+sample of each, 0.32 s after it began, is compared. 12 touches come first, as evidence for the compensation of
+sheets. Deployment files describe sheets as their builder would, and state the standard deviations of the
+parts and contacts of their world, also those of uneven sheets and elongated contacts. Pads are mounted as
+stated; for mounts and joints see [grasp](grasp.md). Sheets are fresh, and stated to be (`back_force_std_n`
+0): the default of 0.1 N for loads before the daemon's start widens forces below 1 N. *After 32 (256)
+contacts*: with the gains and parts that automatic calibration learned from so many other touches of each pad,
+where it reached that state; it doesn't use touches within 5 % of a side from an edge, weak ones and saturated
+ones.
+
+Errors and deviations in mm and N; tables by a quantity are as configured. Touches of one pad share its parts:
+intervals are of touches on these pads. The oracle knows the history of the sheet, and neither drift nor
+uneven sheets nor elongated patches; contacts don't measure a pad's size, so positions keep its tolerance.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.hand_touches import (
-    FORCES_N,
     REST_S,
     SAMPLE_S,
     STEP_S,
@@ -34,8 +40,8 @@ from benchmarks.hand_touches import (
     draw_touches,
 )
 from benchmarks.oracle import PadOracle
-from benchmarks.page import made_by, options, output_folder, table
-from benchmarks.scores import Estimates, EstimateScore, concatenate, draw_calibration, slices
+from benchmarks.page import Report, options
+from benchmarks.scores import Estimates, EstimateScore, concatenate, slices
 from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
@@ -52,26 +58,12 @@ from handtouch.simulate.worlds import (
     Family,
     MountSpread,
     Normal,
-    PartSpread,
-    Uniform,
     World,
 )
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 FloatArray = NDArray[np.float64]
 NAMED = ("ideal", "default", "harsh")
 SINGLE = {
-    "gaps 0.2 mm": World("gaps 0.2 mm", PartSpread(gap_offset_mm=Uniform(-0.2, 0.2))),
-    "gains 0.5 %, gaps 0.05 mm": World(
-        "gains 0.5 %, gaps 0.05 mm",
-        PartSpread(gain_ratio=Uniform(0.995, 1.005), gap_offset_mm=Uniform(-0.05, 0.05)),
-    ),
-    "gains 2 %, gaps 0.2 mm": World(
-        "gains 2 %, gaps 0.2 mm",
-        PartSpread(gain_ratio=Uniform(0.98, 1.02), gap_offset_mm=Uniform(-0.2, 0.2)),
-    ),
     "radius": World("radius", contacts=ContactSpread(radius_sigma=Normal(0.0, 1.0))),
 }
 """Worlds in which only some quantities are hidden; contact patches as stated."""
@@ -244,14 +236,15 @@ UNITS = {"position": ("mm", 1e3), "force": ("N", 1.0)}
 
 def rows_of(parts: Mapping[str, Estimates], quantity: str) -> list[dict[str, Any]]:
     return [
-        {"": name, **EstimateScore.of_estimates(part).row(UNITS[quantity][1])} for name, part in parts.items()
+        {"case": name, **EstimateScore.of_estimates(part).row(UNITS[quantity][1])}
+        for name, part in parts.items()
     ]
 
 
-def sections(found: Mapping[str, Mapping[str, Estimates]]) -> list[str]:
-    """Return the lines of all tables, which are printed too."""
-    page = table("Sharpness by contacts", "World `default`.", sharpness(found))
-    for quantity, (unit, _) in UNITS.items():
+def add_tables(report: Report, found: Mapping[str, Mapping[str, Estimates]]) -> None:
+    """Add all tables to the report."""
+    report.table("Sharpness by contacts", sharpness(found))
+    for quantity in UNITS:
         every = {name: found[name][quantity] for name in found}
         parts = {
             f"{name}, {state}": by_state[state]
@@ -259,24 +252,21 @@ def sections(found: Mapping[str, Mapping[str, Estimates]]) -> list[str]:
             for state in STATES
             if state in by_state
         }
-        page += table(quantity.capitalize(), f"Errors and deviations in {unit}.", rows_of(parts, quantity))
+        report.table(quantity.capitalize(), rows_of(parts, quantity))
         for by in SLICES:
             cut = {
                 f"{name}, {value}": part
                 for name in NAMED
                 for value, part in slices(dict(slices(every[name], "state"))[CONFIGURED], by)
             }
-            page += table(f"{quantity.capitalize()} by {by}", "As configured.", rows_of(cut, quantity))
+            report.table(f"{quantity.capitalize()} by {by}", rows_of(cut, quantity))
     radius = dict(slices(found["radius"]["force"], "state"))[CONFIGURED]
     cut = {
         f"{sheet}, {value}": part
         for sheet, own in slices(radius, "sheet")
         for value, part in slices(own, "force")
     }
-    page += table(
-        "Force with hidden radius alone", "As configured, all else as stated.", rows_of(cut, "force")
-    )
-    return page
+    report.table("Force with hidden radius alone", rows_of(cut, "force"))
 
 
 def sharpness(found: Mapping[str, Mapping[str, Estimates]]) -> list[dict[str, Any]]:
@@ -296,26 +286,12 @@ def sharpness(found: Mapping[str, Mapping[str, Estimates]]) -> list[dict[str, An
     return rows
 
 
-def draw(found: Mapping[str, Mapping[str, Estimates]], path: Path) -> None:
-    """Draw stated against observed probability, as configured and after the first contacts."""
-    figure, panels = plt.subplots(2, 2, figsize=(9, 9), layout="constrained")
-    for axes, quantity in zip(panels, UNITS, strict=True):
-        for panel, state in zip(axes, STATES[:2], strict=True):
-            draw_calibration(
-                panel, {name: dict(slices(found[name][quantity], "state"))[state] for name in NAMED}
-            )
-            panel.set_title(f"{quantity}, {state}")
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument(
         "--hands", type=int, default=8, help="of each named world; half as many of the others"
     )
     parser.add_argument("--touches", type=int, default=20, help="of each pad")
-    parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.touches = 1, 2
@@ -327,7 +303,7 @@ def main() -> None:
         for number in range(asked.hands if name in NAMED else few)
     ]
     made: dict[str, list[dict[str, Estimates]]] = {name: [] for name in names}
-    with ProcessPoolExecutor(asked.workers) as pool:
+    with ProcessPoolExecutor(os.cpu_count() or 1) as pool:
         for task, result in zip(tasks, pool.map(play, tasks), strict=True):
             made[task[0]].append(result)
             print(f"{task[0]}: hand {task[1] + 1}", flush=True)
@@ -335,47 +311,9 @@ def main() -> None:
         name: {quantity: concatenate([part[quantity] for part in parts]) for quantity in UNITS}
         for name, parts in made.items()
     }
-    out = output_folder(asked.quick)
-    head = [
-        "# Position and force by world", "",
-        f"{made_by()}; {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}.", "",
-        HEAD.format(
-            hands=asked.hands, few=few, touches=asked.touches, low=FORCES_N[0], high=FORCES_N[1],
-        ), "", "![stated and observed probability](worlds.png)", "",
-    ]  # fmt: skip
-    (out / "worlds.md").write_text("\n".join([*head, *sections(found)]))
-    record = {
-        f"{name}, {state}, {quantity}": asdict(EstimateScore.of_estimates(part))
-        for name, both in found.items()
-        for quantity, every in both.items()
-        for state, part in slices(every, "state")
-    }
-    (out / "worlds.json").write_text(json.dumps(record, indent=1).replace("NaN", "null") + "\n")
-    draw(found, out / "worlds.png")
-
-
-HEAD = """\
-{hands} hands of each of the [worlds](../worlds.md) `ideal`, `default` and `harsh`, and {few} of each world
-with few hidden quantities; 15 pads each, of four surfaces; seeds of the reporting family. {touches} touches
-of each pad, {low:g} to {high:g} N (log-uniform), anywhere from 2 % of a side inside the edges; one sample of
-each, 0.32 s after it began. 12 touches come first, as evidence for the compensation of sheets. Deployment
-files describe sheets as their builder would, and state the standard deviations of the parts and contacts of
-their world, also those of uneven sheets and elongated contacts. Pads are mounted as stated; for mounts and
-joints see [grasp](grasp.md). Sheets are fresh, and stated to be (`back_force_std_n` 0): the default of 0.1 N
-for loads before the daemon's start widens forces below 1 N. *After 32 (256) contacts*: with the gains and
-parts that automatic calibration learned from so many other touches of each pad, where it reached that state.
-It doesn't use touches within 5 % of a side from an edge, weak ones and saturated ones.
-
-* Shares are in % of valid estimates, with 95 % intervals (Clopper and Pearson); those of *valid* are of all
-  touches, also missed ones. Touches of one pad share its parts: the intervals are of touches on these pads.
-* *> 5 sigma*: Mahalanobis distance of the truth from the estimate.
-* *Oracle*: the standard deviation that an estimator could honestly state that knows the distributions of
-  gains, gaps, sizes, sheets and patches, but not their values, and what all contacts before say about them:
-  Laplace's approximation about the true values. It knows the history of the sheet, and neither drift nor
-  uneven sheets nor elongated patches. Contacts don't measure
-  a pad's size, so positions keep its tolerance.
-* *CRPS*: of normal distributions in closed form; of positions, in two dimensions, the energy score.
-* *Error / bound*: of each touch by its own bound from noise alone (Cramer-Rao): rms, and quantiles."""
+    report = Report(asked.quick, hands=asked.hands, touches_of_a_pad=asked.touches)
+    add_tables(report, found)
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Independent check of what clients show, for soaks: nothing may contradict the truth of a simulated hand.
 
-Public names: `Truth`, `HandCheck`, `RosCheck`, `watch_hand`, `watch_ros`, `longest_age_s`, `CHECKED`.
+Public names: `Truth`, `HandCheck`, `RosCheck`, `watch_hand`, `watch_ros`, `longest_age_s`.
 The truth is the scenario, played from the
 first SYNC on, and the times at which the daemon died; nothing of it comes from the daemon. Rules: a pad whose
 touch isn't known is shown as unknown and never as zero; a frame is no older than its limit by its own time; a
@@ -41,12 +41,6 @@ from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.worlds import WORLDS, Family
 
-CHECKED = (
-    "A checker beside the other clients knows the scenario, and when the daemon died: nothing may contradict "
-    "it. No touched pad is shown as clear, nor the reverse, from 0.3 s after a change on; what isn't sampled "
-    "is unknown, also in sums; no frame is older than its limit; a dead daemon is known within 50 ms."
-)
-"""Note of a table of `Found.figures`"""
 SETTLED_NS = 300_000_000
 """Time after a change of a touch until it must be shown: filters of nodes, and the detection"""
 MIN_FORCE_N = 0.35

@@ -1,8 +1,8 @@
 """Days of a hand in use, faster than real time: the daemon's parts in one process, time as an argument.
 
-Public names: `Days`, `run_days`. The samples come from another process. From the samples on everything is
-the daemon's: pipeline, percepts, supervision with its store on a small disk, recorder. Not here: sockets,
-the CANopen master, whose events of replaced nodes are injected, and child processes (`cycled_processes`).
+Public names: `Days`, `run_days`. The samples come from another process. From the samples on everything is the
+daemon's: pipeline, percepts, supervision with its store on a small disk, recorder. Not here: sockets, the
+CANopen master, whose events of replaced nodes are injected, and child processes (`cycled_processes`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import multiprocessing
 import os
 import queue
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -28,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from benchmarks.bench_latency import descriptors, resident_mb
-from benchmarks.inline_process import InlineProcess
+from benchmarks.daemon_settings import InlineProcess
 from benchmarks.page import progress
+from benchmarks.served_hand import descriptors, resident_mb
 from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
 from handtouch import wire
 from handtouch.calibration.store_client import StoreClient
@@ -53,7 +52,8 @@ from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import WorkerConfig, pack_worker_message
 from handtouch.supervisor.worker import SupervisorWorker
 from handtouch.wire import PERCEPT_KINDS, PadState
-from handtouch.wire.status import ForceStatus, PositionStatus
+from handtouch.wire.status import PositionStatus
+from tests.client.hand_messages import make_service
 
 FloatArray = NDArray[np.float64]
 SEED = 41
@@ -268,15 +268,12 @@ class LogLines(logging.Handler):
 
 
 @dataclass
-class HourRow:
-    """Figures of one hour."""
+class Compared:
+    """Ticks and contacts, and positions compared with their truth: whether they lie in their 95 % region."""
 
     ticks: int = 0
     contacts: int = 0
-    tick_us: list[float] = field(default_factory=list)
-    squared_mm2: list[float] = field(default_factory=list)
     inside: list[bool] = field(default_factory=list)
-    force_inside: list[bool] = field(default_factory=list)
 
 
 class Session:
@@ -322,17 +319,15 @@ class Session:
                 before, self.serials[pad] = self.serials[pad], serial
                 self.supervisor.handle_node_events([SerialChanged(pad, now_ns, before, serial)], now_ns)
 
-    def tick(self, sync_ns: int, samples: list[bytes]) -> float:
-        """Run a cycle; return its processor time [us], without recording and supervision."""
+    def tick(self, sync_ns: int, samples: list[bytes]) -> None:
+        """Run a cycle."""
         pipeline, recorder = self.pipeline, self.recording.recorder
         self.recording.now_ns = sync_ns
         pipeline.begin_cycle(sync_ns, sync_ns)
         for pad, data in enumerate(samples):
             pipeline.slab.write_pdo(pad, data, sync_ns + 1000 + 100 * pad)
-        begin = time.thread_time_ns()
         now_ns = sync_ns + PERIOD_NS - 1  # beyond the sample window: at first, no pad is expected
         result = pipeline.tick_if_due(now_ns)
-        took_us = (time.thread_time_ns() - begin) * 1e-3
         assert result is not None
         self.percepts.process_tick(result, now_ns)
         pipeline.prepare_next_tick()
@@ -342,7 +337,6 @@ class Session:
             message = pipeline.journal.retained_messages()["state"](sync_ns)
             assert message is not None
             self.recording.send(message)
-        return took_us
 
     def send_service(self, now_ns: int) -> None:
         """Send the message that has the wall clock's offset."""
@@ -350,16 +344,20 @@ class Session:
         offset_ns = round(EPOCH.timestamp() * 1e9)
         pipeline = self.pipeline
         self.recording.send(
-            wire.Service(
-                v=wire.SCHEMA_VERSION, session=self.number, seq=self._service_seq, t_ns=now_ns,
-                wall_offset_ns=offset_ns, version="", pid=1, uptime_s=now_ns * 1e-9,
-                period_s=PERIOD_NS * 1e-9, hands=self._links, ticks=pipeline.ticks, overruns=0,
-                rate_hz=BUSY_HZ, core_compiled=True, tick_us={}, loop={},
-                contacts=pipeline.tick.contacts.begun_count, rejected={}, process={}, buses={},
-                congestion_episodes={}, subscriptions=(), retained=False,
+            make_service(
+                self._service_seq,
+                self.number,
+                t_ns=now_ns,
+                wall_offset_ns=offset_ns,
+                uptime_s=now_ns * 1e-9,
+                period_s=PERIOD_NS * 1e-9,
+                hands=self._links,
+                ticks=pipeline.ticks,
+                rate_hz=float(BUSY_HZ),
+                contacts=pipeline.tick.contacts.begun_count,
                 supervisor=self.supervisor.statistics(),
             )
-        )  # fmt: skip
+        )
 
     def end(self, now_ns: int) -> None:
         """End the session as the daemon does."""
@@ -370,7 +368,7 @@ class Session:
 
 def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path) -> dict[str, Any]:
     """Run all hours; `fill` fills the store's disk (True) or frees it. Return figures, also by hour."""
-    log, rows = LogLines(), [HourRow() for _ in range(int(np.ceil(days.hours)))]
+    log, whole = LogLines(), Compared()
     logger = logging.getLogger("handtouch")
     logger.addHandler(log)
     recording = Recording(folder)
@@ -385,7 +383,6 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
     for times, counts, truth in from_process(days.batches):
         now_s = float(times[0]) * 1e-9
         log.now_s = now_s
-        hour = rows[min(int(now_s / 3600), len(rows) - 1)]
         while steps and steps[0][0] <= now_s:
             _, act, begins = steps.pop(0)
             if act.kind == "disk full":
@@ -400,12 +397,12 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
                 begun = 0
         session.assign_nodes(days.serials_at(now_s - BOOT_S), int(times[0]))
         for sync_ns, sample in zip((times + 10**9).tolist(), counts.astype("<i2"), strict=True):
-            hour.tick_us.append(session.tick(sync_ns, [pad.tobytes() for pad in sample]))
+            session.tick(sync_ns, [pad.tobytes() for pad in sample])
         if truth:
-            compare(session.pipeline, truth, faulty_pads(days, now_s), hour)
-        hour.ticks += len(times)
+            compare(session.pipeline, truth, faulty_pads(days, now_s), whole)
+        whole.ticks += len(times)
         now_begun = session.pipeline.tick.contacts.begun_count
-        hour.contacts += int(now_begun - begun)
+        whole.contacts += int(now_begun - begun)
         begun = now_begun
         for pad, assessment in enumerate(session.supervisor.assessments):
             for diagnosis in assessment.diagnoses if assessment else ():
@@ -418,7 +415,7 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
             gc.collect()
             used = resident_mb(os.getpid()), descriptors(os.getpid()), len(gc.get_objects())
             size = sum(path.stat().st_size for path in store.parent.glob(f"{store.name}*"))
-            memory.append((now_s / 3600, *used, size, kept_mb(rows, diagnosed.values())))
+            memory.append((now_s / 3600, *used, size, kept_mb(diagnosed.values())))
             if len(memory) % 6 == 1:
                 progress(
                     f"{now_s / 3600:.1f} of {days.hours:g} h, {used[0]:.0f} MB, {len(log.lines)} warnings"
@@ -432,7 +429,7 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
     logger.removeHandler(log)
     return {
         "hours": days.hours,
-        "by_hour": [summary(row) for row in rows],
+        "whole": whole,
         "memory": memory,
         "gain_errors": gains,
         "states": states,
@@ -449,10 +446,9 @@ def run_days(days: Days, store: Path, fill: Callable[[bool], None], folder: Path
     }
 
 
-def kept_mb(rows: list[HourRow], diagnosed: Iterable[list[float]]) -> float:
-    """Return the memory [MB] of what the test keeps itself: a number and its place a tick and report."""
-    count = sum(row.ticks for row in rows) + sum(map(len, diagnosed))
-    return 32e-6 * count
+def kept_mb(diagnosed: Iterable[list[float]]) -> float:
+    """Return the memory [MB] of what the test keeps itself: a number and its place a report."""
+    return 32e-6 * sum(map(len, diagnosed))
 
 
 def wall(now_ns: int) -> datetime:
@@ -499,22 +495,18 @@ def faulty_pads(days: Days, t_s: float) -> set[int]:
 
 
 def compare(
-    pipeline: Pipeline, truth: list[tuple[int, FloatArray, float]], faulty: set[int], hour: HourRow
+    pipeline: Pipeline, truth: list[tuple[int, FloatArray, float]], faulty: set[int], whole: Compared
 ) -> None:
-    """Compare published positions and forces with the truth of this tick."""
+    """Compare published positions with the truth of this tick."""
     columns, touching = pipeline.tick.columns, pipeline.tick.contacts.touching
-    for row, position_m, force_n in truth:
+    for row, position_m, _ in truth:
         if not touching[row] or row in faulty:
             continue
         if columns.position_status[row] == PositionStatus.VALID:
             error = columns.position_m[row] - position_m
             covariance = columns.covariance_m2[row].reshape(3, 3)
-            hour.squared_mm2.append(float(error @ error) * 1e6)
             distance = float(error @ np.linalg.pinv(covariance, rcond=1e-6, hermitian=True) @ error)
-            hour.inside.append(distance < chi2.ppf(0.95, 2))
-        if columns.force_status[row] == ForceStatus.VALID:
-            off = abs(columns.force_n[row] - force_n) / columns.force_std_n[row]
-            hour.force_inside.append(bool(off < 1.96))
+            whole.inside.append(distance < chi2.ppf(0.95, 2))
 
 
 def gain_errors(days: Days, session: Session) -> list[float]:
@@ -535,23 +527,3 @@ def spans(times: list[float], gap_s: float = 5.0) -> list[tuple[float, float]]:
     cut = np.flatnonzero(np.diff(at) > gap_s)
     first, last = np.r_[at[:1], at[cut + 1]], np.r_[at[cut], at[-1:]]
     return list(zip(first.tolist(), last.tolist(), strict=True))
-
-
-def mean(values: list[bool]) -> float:
-    """Return the share of True, NaN of nothing."""
-    return sum(values) / len(values) if values else float("nan")
-
-
-def summary(row: HourRow) -> Mapping[str, float]:
-    """Return the figures of an hour."""
-    return {
-        "ticks": row.ticks,
-        "contacts": row.contacts,
-        "tick_p50_us": float(np.median(row.tick_us or [np.nan])),
-        "tick_p99_us": float(np.percentile(row.tick_us or [np.nan], 99)),
-        "compared": len(row.inside),
-        "rms_mm": float(np.sqrt(np.mean(row.squared_mm2 or [np.nan]))),
-        "inside": mean(row.inside),
-        "forces": len(row.force_inside),
-        "force_inside": mean(row.force_inside),
-    }

@@ -14,7 +14,6 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -22,10 +21,10 @@ from typing import IO, Any
 
 import numpy as np
 
-from benchmarks.bench_latency import descriptors, in_own_network, on_loopback, resident_mb
 from benchmarks.client_checks import Truth, longest_age_s, watch_hand, watch_ros
 from benchmarks.compressed_days import Act
 from benchmarks.page import ROOT, progress
+from benchmarks.served_hand import descriptors, in_own_network, on_loopback, resident_mb
 from handtouch.client import connect, request
 from handtouch.config import load
 
@@ -190,8 +189,8 @@ def run_cycles(minutes: float, folder: Path, fill: Callable[[bool], None]) -> di
                     "cycle": cycle,
                     "trouble": kind,
                     "frames": len(late_ms),
-                    "p50_ms": float(np.median(late_ms or [np.nan])),
-                    "p99_ms": float(np.percentile(late_ms or [np.nan], 99)),
+                    "p50, ms": float(np.median(late_ms or [np.nan])),
+                    "p99, ms": float(np.percentile(late_ms or [np.nan], 99)),
                     "lost": reader.lost_messages,
                 }
             )
@@ -206,8 +205,6 @@ def run_cycles(minutes: float, folder: Path, fill: Callable[[bool], None]) -> di
         "served": [served, served_again],
         "ends": [(at - start_s, name, code) for at, name, code in processes.ends],
         "supervisor": status["service"]["supervisor"],
-        "pads": Counter(pad["calibration_state"] for pad in status["pads"]),
-        "store_bytes": sum(file.stat().st_size for file in folder.glob("calibrations.db*")),
         "checked": [found.figures() for found in (checked.finish(), checked_ros.found)],
         "contradictions": [*checked.found.texts, *checked_ros.found.texts],
         "log": [(at - start_s, name, line) for at, name, line in processes.lines],

@@ -1,6 +1,7 @@
-"""Pipeline with the daemon's own settings, for benchmarks that measure what the daemon computes.
+"""The daemon's pipeline with its own settings, and its percept process in this one.
 
-Public names: `pipeline_of`; `decoded`, a message as a subscriber has it.
+Public names: `pipeline_of`; `decoded`, a message as a subscriber has it; `InlineProcess`, the percept
+process' worker in this process, so that a run is repeatable and as fast as it can be.
 """
 
 from __future__ import annotations
@@ -10,7 +11,10 @@ from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.tick_messages import MessageSink
+from handtouch.daemon.child_process import ChildProcess
 from handtouch.hand.robot_models import RobotModels
+from handtouch.percept.messages import pack_message, unpack_input
+from handtouch.percept.worker import PerceptWorker
 from handtouch.wire import PadState
 
 
@@ -38,3 +42,35 @@ def pipeline_of(
 def decoded(message: wire.OutgoingMessage) -> wire.Message:
     """Return what a subscriber decodes of a message."""
     return wire.decode(wire.encode(message))
+
+
+class InlineProcess(ChildProcess):
+    """Exchanges the same messages as the process, which it never starts."""
+
+    def __init__(self, deployment: Deployment) -> None:
+        super().__init__("", "percept", lambda: b"")
+        self.worker = PerceptWorker(deployment)
+        self.waiting: list[bytes] = []
+
+    @property
+    def pid(self) -> int | None:
+        """Any number while it is enabled."""
+        return 1 if self.enabled else None
+
+    def start(self, now_ns: int) -> None:  # noqa: ARG002
+        """Enable it."""
+        self.enabled = True
+
+    def poll(self, now_ns: int) -> bool:  # noqa: ARG002
+        """Return False: there is nothing to start."""
+        return False
+
+    def send(self, message: bytes) -> bool:
+        """Process a message at once."""
+        self.waiting += map(pack_message, self.worker.process_input(unpack_input(message)))
+        return True
+
+    def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:  # noqa: ARG002
+        """Return what the worker has sent."""
+        received, self.waiting = self.waiting[:max_messages], self.waiting[max_messages:]
+        return received

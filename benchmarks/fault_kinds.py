@@ -1,70 +1,492 @@
-"""The kinds of faults of the campaign in stress_faults.py, and the expected report of each.
+"""The kinds of faults of the campaign in stress_faults.py.
 
-Public names: `KINDS`.
+How each is caused on a node or on the bus, how it is removed, and the expected report of each. Public names:
+`KINDS` -> `Kind`, `Fault`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+import random
 import re
-from collections.abc import Callable
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from benchmarks.fault_acts import (
-    ABORT,
-    Fault,
-    Kind,
-    ReportCheck,
-    alive,
-    all_off,
-    all_on,
-    all_reboot,
-    answers,
-    attribute,
-    babble,
-    boot_loop,
-    brown_out,
-    brown_outs,
-    bus_off,
-    change,
-    chatter,
-    dead,
-    disable_tpdo,
-    emergency,
-    fail_at_step,
-    fail_object,
-    foreign,
-    freeze,
-    garble,
-    heal_sdo,
-    hush,
-    illegal_state,
-    latch,
-    late,
-    legal_state,
-    line,
-    malformed,
-    nmt,
-    no_beat_time,
-    no_boot_loop,
-    no_emergency,
-    no_line,
-    no_twin,
-    nothing,
-    plug,
-    reboot,
-    release,
-    saturate,
-    sending,
-    silence,
-    sound,
-    stick,
-    swap,
-    swap_back,
-    sync,
-    twin,
-    unlatch,
-    unplug,
-)
+import can
+import numpy as np
+
+from benchmarks.served_hand import CHANNEL, PORT
+from handtouch.config import Deployment
+from handtouch.device import Device, DeviceBus, LineFaults
+
+S = 1_000_000_000
+TPDO = 0x280
+PRESSED = ("thumb_distal", "index_distal", "palm_heel")
+TOUCH = np.array([900, 700, 800, 600])
+LONG_NS = 250_000_000  # a pause that may cost a node its heartbeats
+
+
+class Cable:
+    """The nodes' bus: can be cut, counts the samples that went out, and notes the nodes' pauses."""
+
+    def __init__(self, bus: can.BusABC, period_ns: int) -> None:
+        self.silent = False
+        self.samples = 0
+        self.pauses: list[tuple[int, int, int]] = []  # node id, from, to
+        self._bus, self._period_ns = bus, period_ns
+        self._last_ns: dict[int, int] = {}
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        if self.silent:
+            return
+        self._bus.send(message, timeout)
+        node_id = message.arbitration_id - TPDO
+        if not 0 < node_id < 128:
+            return
+        self.samples += len(message.data) == 8
+        now_ns = time.monotonic_ns()
+        before_ns = self._last_ns.get(node_id, now_ns)
+        self._last_ns[node_id] = now_ns
+        if now_ns - before_ns > 1.5 * self._period_ns:
+            self.pauses.append((node_id, before_ns, now_ns))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        message = self._bus.recv(timeout)
+        return None if self.silent else message
+
+    def paused(self, node_id: int, t_ns: int, lag: float = 0.0) -> bool:
+        """Return True if the node's program or SYNC paused at this time, for two periods less `lag`.
+
+        A pad is stale after three, counted from the SYNC of its newest sample, not from its sending. After a
+        long pause the node has to be restarted.
+        """
+        least_ns = (2 - lag) * self._period_ns
+        return any(
+            node == node_id
+            and end - start > least_ns
+            and start <= t_ns <= end + (S if end - start > LONG_NS else S // 10)
+            for node, start, end in self.pauses
+        )
+
+
+class Resources:
+    """Memory, descriptors and threads of a process, once a second."""
+
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
+        self._process, self._pid = process, process.pid
+        self.rows: list[tuple[float, int, int, int]] = []
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def look(self, t_ns: int) -> None:
+        if self.rows and t_ns * 1e-9 - self.rows[-1][0] < 1:
+            return
+        if not self.alive:
+            raise RuntimeError("the daemon has ended")
+        status = Path(f"/proc/{self._pid}/status").read_text()
+        rss_kb, threads = (int(re.search(rf"{name}:\s+(\d+)", status)[1]) for name in ("VmRSS", "Threads"))  # type: ignore[index]
+        self.rows.append((t_ns * 1e-9, rss_kb, len(os.listdir(f"/proc/{self._pid}/fd")), threads))
+
+    def summary(self) -> dict[str, Any]:
+        """The slope is that of the second half, if that is long enough: by then all has happened once."""
+        rows = np.array(self.rows)
+        late = rows[len(rows) // 2 :]
+        slope = np.polyfit(late[:, 0], late[:, 1], 1)[0] * 60 if len(late) > 60 else 0.0
+        return {
+            "rss_mb": [round(float(v) / 1024, 1) for v in (rows[0, 1], late[0, 1], rows[-1, 1])],
+            "rss_kb_per_min": round(float(slope), 1),
+            "descriptors": [int(v) for v in (rows[0, 2], late[0, 2], rows[-1, 2], rows[:, 2].max())],
+            "threads": [int(v) for v in (rows[0, 3], late[0, 3], rows[-1, 3], rows[:, 3].max())],
+        }
+
+
+class UnknownDevice:
+    """Another device on the bus; `pump` sends what is due."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._jobs: dict[int, tuple[Callable[[], can.Message], int, int]] = {}  # fault -> next, period, due
+
+    def start(self, key: int, frame: Callable[[], can.Message], rate_hz: float) -> None:
+        self._jobs[key] = (frame, int(S / rate_hz), time.monotonic_ns())
+
+    def stop(self, key: int) -> None:
+        self._jobs.pop(key, None)
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._jobs)
+
+    def pump(self, t_ns: int) -> None:
+        for key, (frame, period_ns, due_ns) in list(self._jobs.items()):
+            due_ns = max(due_ns, t_ns - 20 * period_ns)
+            while due_ns <= t_ns:
+                self.send(frame())
+                due_ns += period_ns
+            self._jobs[key] = (frame, period_ns, due_ns)
+
+    def send(self, message: can.Message) -> None:
+        with contextlib.suppress(can.CanError, OSError):
+            self._bus.send(message)
+
+
+@dataclass
+class Bench:
+    """Devices, bus and frames that faults act on."""
+
+    devices: DeviceBus
+    unknown_device: UnknownDevice
+    period_ns: int
+    cable: Any
+    """the nodes' side of the bus, with `silent` to cut it"""
+
+
+def open_bus(interface: str) -> can.BusABC:
+    if interface == "socketcan":
+        return can.Bus("vcan0", interface="socketcan", ignore_config=True)
+    return can.Bus(CHANNEL, interface="udp_multicast", port=PORT, ignore_config=True)
+
+
+def sampler(deployment: Deployment, seed: int) -> Any:
+    """Counts of all pads: noise, and a steady touch on those that are pressed."""
+    pads = [pad for hand in deployment.hands for pad in hand.pads]
+    noise = np.random.default_rng(seed)
+    pressed = np.array([TOUCH if pad.link in PRESSED else 0 * TOUCH for pad in pads])
+    return lambda _: pressed + np.rint(noise.standard_normal((len(pads), 4))).astype(np.int64)
+
+
+SYNC_ID, NMT, SDO_ANSWER, HEARTBEAT = 0x080, 0x000, 0x580, 0x700
+BOOT_REQUESTS = (*range(1, 5), *range(7, 17))
+"""SDO requests of the boot of a shipped node; an abort of each is reported. The fifth and the sixth read the
+error register and history, which a node may refuse."""
+ABORT = 0x08000000
+OBJECTS = ((0x1018, 1), (0x1018, 4), (0x1A01, 0), (0x1A01, 2), (0x1801, 1), (0x1801, 2), (0x1017, 0))
+
+
+@dataclass
+class Fault:
+    """One fault while it lasts, on a node or (device None) on the bus. Times in ns, monotonic."""
+
+    kind: Kind
+    number: int
+    device: Device | None
+    nodes: tuple[int, ...]
+    """ids of the nodes that it may disturb"""
+    chance: random.Random
+    start_ns: int
+    end_ns: int
+    health: dict[int, Any]
+    """node id -> its message before"""
+    bus: Mapping[str, Any]
+    """its statistics in `service` before, and now"""
+    bus_now: Mapping[str, Any] = field(default_factory=dict)
+    ended_ns: int = 0
+    reported_ns: dict[int, int] = field(default_factory=dict)
+    """node id, 0 for the bus -> when the right cause was reported"""
+    well_ns: dict[int, int] = field(default_factory=dict)
+    history: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    disturbed_ns: list[int] = field(default_factory=list)
+    """when it changed a state that must not change"""
+    kept: Any = None
+    """whatever has to be restored"""
+
+    @property
+    def node(self) -> Device:
+        """Device with the fault."""
+        assert self.device is not None
+        return self.device
+
+
+ReportCheck = Callable[[Fault, Any], bool]
+"""Returns True if a health message reports the cause"""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault.
+
+    `begin` and `end` cause and remove it; `lasts_s` are the shortest and longest time between. `reported`
+    checks that a health message of the node reports it, `reported_by_bus` that the bus statistics in
+    `service` do; with neither no report is required. `quiet`: the node must stay operational and its samples
+    valid; `loose`: the node must stay operational, but its samples are wrong, which the supervisor diagnoses.
+    `within_s` limits the time to the report, `well_s` the time to recovery.
+    """
+
+    name: str
+    expected: str
+    begin: Callable[[Fault, Any], None]
+    end: Callable[[Fault, Any], None]
+    lasts_s: tuple[float, float] = (0.4, 1.5)
+    reported: ReportCheck | None = None
+    reported_by_bus: Callable[[Fault], bool] | None = None
+    quiet: bool = False
+    loose: bool = False
+    bus_wide: bool = False
+    alone: bool = False
+    lag: float = 0.0
+    """periods by which its samples are late; shortens the pause that makes it stale"""
+    within_s: float = 1.0
+    well_s: float = 2.0
+    unstable: bool = False
+    """the node doesn't stay operational: it has no other fault until it is stable again"""
+    repaired: bool = False
+    """changed settings, which are repaired a few times in a row only"""
+    weight: float = 1.0
+
+
+# How faults begin and end --------------------------------------------------------------------------------
+
+
+def nothing(_: Fault, __: Any) -> None:
+    """Do nothing: the fault ends by itself."""
+
+
+def line(**settings: Any) -> Callable[[Fault, Any], None]:
+    def begin(fault: Fault, _: Any) -> None:
+        fault.node.line = LineFaults(**settings, seed=fault.number)
+
+    return begin
+
+
+def node(method: str, *arguments: Any) -> Callable[[Fault, Any], None]:
+    """Call a method of the node."""
+    return lambda fault, _: getattr(fault.node, method)(*arguments)
+
+
+def restore(name: str, value: Any) -> Callable[[Fault, Any], None]:
+    """Set an attribute of the node."""
+    return lambda fault, _: setattr(fault.node, name, value)
+
+
+def every_node(method: str) -> Callable[[Fault, Any], None]:
+    """Call a method of all nodes."""
+
+    def act(_: Fault, bench: Any) -> None:
+        for device in list(bench.devices.devices.values()):
+            getattr(device, method)()
+
+    return act
+
+
+def cable(silent: bool) -> Callable[[Fault, Any], None]:
+    """Cut or mend the nodes' cable."""
+    return lambda _, bench: setattr(bench.cable, "silent", silent)
+
+
+def one_channel(method: str) -> Callable[[Fault, Any], None]:
+    """Call a method of the node with a random channel."""
+    return lambda fault, _: getattr(fault.node, method)(fault.chance.randrange(4))
+
+
+def dead(fault: Fault, _: Any) -> None:
+    fault.node.open_electrodes = {fault.chance.randrange(4)}
+
+
+def brown_out(fault: Fault, _: Any) -> None:
+    fault.node.brown_out(fault.end_ns - fault.start_ns)
+
+
+def late(fault: Fault, bench: Any) -> None:
+    """Delay samples until after their tick, before the next SYNC."""
+    fault.node.line = LineFaults(late_ns=round(fault.kind.lag * bench.period_ns))
+
+
+def no_line(fault: Fault, _: Any) -> None:
+    fault.node.line = None
+
+
+def attribute(name: str, during: Any, after: Any) -> dict[str, Any]:
+    """Set an attribute of the node, and restore it."""
+    return {
+        "begin": lambda fault, _: setattr(fault.node, name, during),
+        "end": lambda fault, _: setattr(fault.node, name, after),
+    }
+
+
+def brown_outs(fault: Fault, _: Any) -> None:
+    """Cause three brown-outs in quick succession, during the boot."""
+    away_ms = fault.chance.randrange(2, 60)
+    every_ms = away_ms + fault.chance.randrange(3, 120)
+    fault.node.brown_out(away_ms * 1_000_000, times=3, every_ns=every_ms * 1_000_000)
+
+
+def bus_off(fault: Fault, _: Any) -> None:
+    fault.node.bus_off(fault.end_ns - fault.start_ns, boots=fault.kind.name.endswith("boots"))
+
+
+def swap(fault: Fault, _: Any) -> None:
+    fault.kept = fault.node.serial
+    fault.node.replace_device(fault.kept + 5000)
+
+
+def twin(fault: Fault, bench: Any) -> None:
+    fault.kept = bench.devices.add_twin(fault.node.node_id, serial=fault.node.serial + 7000)
+    fault.kept.plug()
+
+
+def no_twin(fault: Fault, bench: Any) -> None:
+    with bench.devices.lock:
+        fault.kept.unplug()
+        bench.devices.leave(fault.kept)
+
+
+def fail_at_step(code: int | None) -> Callable[[Fault, Any], None]:
+    def begin(fault: Fault, bench: Any) -> None:
+        with bench.devices.lock:
+            server = fault.node.sdo
+            server.fail_nth = {server.requests + fault.chance.choice(BOOT_REQUESTS): code}
+            fault.node.reboot()
+
+    return begin
+
+
+def fail_object(fault: Fault, bench: Any) -> None:
+    with bench.devices.lock:
+        fault.node.sdo.fail[fault.chance.choice(OBJECTS)] = ABORT
+        fault.node.reboot()
+
+
+def garble(how: str) -> Callable[[Fault, Any], None]:
+    def begin(fault: Fault, bench: Any) -> None:
+        with bench.devices.lock:
+            fault.node.sdo.garble = how  # type: ignore[assignment]
+            fault.node.reboot()
+
+    return begin
+
+
+def freeze(reboot: bool) -> Callable[[Fault, Any], None]:
+    def begin(fault: Fault, bench: Any) -> None:
+        with bench.devices.lock:
+            fault.node.sdo.frozen = True
+            if reboot:
+                fault.node.reboot()
+
+    return begin
+
+
+def heal_sdo(fault: Fault, bench: Any) -> None:
+    with bench.devices.lock:
+        server = fault.node.sdo
+        server.frozen, server.garble = False, None
+        server.fail.clear()
+        server.fail_nth = {}
+
+
+def emergency(fault: Fault, _: Any) -> None:
+    fault.kept = 0xFF00 + fault.number % 256
+    fault.node.send_emergency(fault.kept, 0x81, b"hand")
+
+
+def latch(code: int, reboot: bool) -> Callable[[Fault, Any], None]:
+    """Give the node an error that keeps it from being operational."""
+
+    def begin(fault: Fault, bench: Any) -> None:
+        with bench.devices.lock:
+            if reboot:
+                fault.node.unplug()
+            fault.node.latch_error(code, 1)
+            fault.node.plug()
+
+    return begin
+
+
+def boot_loop(fault: Fault, _: Any) -> None:
+    fault.node.start_boot_loop(fault.chance.randrange(80, 250) * 1_000_000)
+
+
+def illegal_state(fault: Fault, _: Any) -> None:
+    fault.kept = fault.chance.choice((1, 2, 3, 6, 99, 126))
+    fault.node.heartbeat_state = fault.kept
+
+
+def disable_tpdo(fault: Fault, _: Any) -> None:
+    fault.node.write_object(0x1801, 1, 0x80000000 | TPDO + fault.node.node_id)
+
+
+def change(index: int, sub: int, value: int) -> Callable[[Fault, Any], None]:
+    """Change a setting, as another client would."""
+    return lambda fault, _: fault.node.write_object(index, sub, value)
+
+
+def nmt(command: int) -> Callable[[Fault, Any], None]:
+    def begin(fault: Fault, bench: Any) -> None:
+        bench.unknown_device.send(message(NMT, bytes((command, fault.node.node_id))))
+
+    return begin
+
+
+def sending(make: Callable[[random.Random, Sequence[int]], can.Message], rate_hz: float) -> dict[str, Any]:
+    """Send frames of an unknown device."""
+
+    def begin(fault: Fault, bench: Any) -> None:
+        nodes = sorted(bench.devices.devices)
+        bench.unknown_device.start(fault.number, lambda: make(fault.chance, nodes), rate_hz)
+
+    return {"begin": begin, "end": lambda fault, bench: bench.unknown_device.stop(fault.number)}
+
+
+def message(can_id: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def foreign(chance: random.Random, _: Sequence[int]) -> can.Message:
+    """Frames with identifiers that no node uses: node ids 0x60 to 0x7F, and 29-bit ones."""
+    if chance.random() < 0.1:
+        return can.Message(arbitration_id=chance.randrange(1 << 29), data=b"\x01\x02", is_extended_id=True)
+    base = chance.choice((0x180, 0x280, 0x580, 0x700, 0x080))
+    return message(base + chance.randrange(0x60, 0x80), chance.randbytes(chance.randint(0, 8)))
+
+
+def sync(_: random.Random, __: Sequence[int]) -> can.Message:
+    """SYNC of another producer."""
+    return message(SYNC_ID)
+
+
+def malformed(chance: random.Random, nodes: Sequence[int]) -> can.Message:
+    """Samples, heartbeats, EMCY and SDO answers with our nodes' identifiers and wrong lengths."""
+    base = chance.choice((TPDO, HEARTBEAT, SDO_ANSWER, SYNC_ID))
+    size = chance.choice((0, 2, 3, 4, 5, 6, 7) if base != HEARTBEAT else (0, 2, 5, 8))
+    return message(base + chance.choice(nodes), chance.randbytes(size))
+
+
+def answers(chance: random.Random, nodes: Sequence[int]) -> can.Message:
+    """Unrequested SDO answers."""
+    return message(SDO_ANSWER + chance.choice(nodes), b"\x43\x18\x10\x04" + chance.randbytes(4))
+
+
+release = node("release_channels")
+saturate = node("saturate_channels")
+hush = node("stop_babbling")
+babble = node("start_babbling", 1000)
+chatter = node("start_babbling", 400, 0x1F0, b"\x01")
+no_emergency = node("send_emergency", 0)
+unlatch = node("clear_error")
+no_boot_loop = node("stop_boot_loop")
+no_beat_time = change(0x1017, 0, 0)
+reboot = node("reboot")
+unplug = node("unplug")
+plug = node("plug")
+silence = cable(silent=True)
+sound = cable(silent=False)
+all_off = every_node("unplug")
+all_on = every_node("plug")
+all_reboot = every_node("reboot")
+stick = one_channel("stick_channel")
+alive, legal_state = restore("open_electrodes", frozenset()), restore("heartbeat_state", None)
+
+
+def swap_back(fault: Fault, _: Any) -> None:
+    fault.node.replace_device(fault.kept)
+
 
 ALONE: dict[str, Any] = {"bus_wide": True, "alone": True, "weight": 0.25}
 

@@ -1,9 +1,8 @@
 """Process one MuJoCo grasp with the daemon's pipeline, and compare the output with MuJoCo's ground truth.
 
 Public names: `drawn_world`, `served` -> `Served`; `against` and `at_best` score its contacts. Samples enter
-at
-200 Hz, joint states at 100 Hz through the decoder of the inputs endpoint, in the order of their arrival, not
-in real time.
+at 200 Hz, joint states at 100 Hz through the decoder of the inputs endpoint, in the order of their arrival,
+not in real time.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from benchmarks.daemon_settings import decoded, pipeline_of
-from benchmarks.inline_process import InlineProcess
+from benchmarks.daemon_settings import InlineProcess, decoded, pipeline_of
 from handtouch import wire
 from handtouch.config import Deployment, Touch
 from handtouch.core.link_poses import LinkPoses

@@ -15,14 +15,13 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from benchmarks.page import OUT, keep_run_time, measured_commit
+from benchmarks.page import OUT, keep_run_time, run_time
 
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
     "diagnose", "worlds", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
     "swap", "shear_slip", "estimate", "percept_grasp", "shear", "design", "switched",
-    "sheet",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside); the
 longest first, so that none of them is the last for long."""
@@ -38,13 +37,13 @@ class Runner:
         self.output = output
         self.options = options
         self.failed: list[Path] = []
-        self._began_s = time.monotonic()
+        self.began_s = time.monotonic()
         output.mkdir(parents=True, exist_ok=True)
 
     @property
     def minutes(self) -> float:
         """Minutes since the runner was made."""
-        return (time.monotonic() - self._began_s) / 60
+        return (time.monotonic() - self.began_s) / 60
 
     def run(self, programs: list[Path], at_once: int) -> None:
         """Run programs, `at_once` at a time; failed ones are added to `failed`."""
@@ -89,7 +88,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("kind", choices=("bench", "soak", "stress"))
     parser.add_argument("name", nargs="?", default="*", help="without it: all of this kind")
     asked, options = parser.parse_known_args(arguments)
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     programs = found(ROOT / "benchmarks", asked.kind, asked.name)
     if not programs:
         known = ", ".join(path.stem.partition("_")[2] for path in found(ROOT / "benchmarks", asked.kind, "*"))
@@ -107,16 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     for path in runner.failed:
         print(f"failed: {path.stem}", flush=True)
     if not runner.failed and not options and asked.name == "*":
-        keep_run_time(
-            OUT,
-            f"all of {asked.kind}",
-            {
-                "minutes": runner.minutes,
-                "cpu_minutes": sum(os.times()[2:4]) / 60,
-                "load": os.getloadavg()[0],
-                "commit": measured_commit(),
-            },
-        )
+        keep_run_time(OUT, f"all of {asked.kind}", run_time(runner.began_s, sum(os.times()[2:4])))
     return 1 if runner.failed else 0
 
 

@@ -1,7 +1,7 @@
 """Scores of estimates with stated covariance, and of detected events; used by every benchmark of accuracy.
 
 Public names: `Share`, `ClusterShare`, `Rate`; `Estimates` -> `EstimateScore`, `slices`, `bin_labels`,
-`calibration_curve`, `draw_calibration`, `laplace_covariance`; `score_events` -> `EventScore`.
+`laplace_covariance`; `score_events` -> `EventScore`.
 
 Rows of `Estimates` are independent touches, one sample of each: samples of one touch share its hidden
 quantities, and binomial intervals of all of them would be too narrow.
@@ -14,15 +14,12 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 from scipy.stats import beta, chi2
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -68,6 +65,9 @@ class Share:
         high = beta.isf(tail, self.count + 1, self.total - self.count) if self.count < self.total else 1.0
         return float(low), float(high)
 
+    def as_plain(self) -> dict[str, float]:
+        return {"count": self.count, "total": self.total}
+
     def __str__(self) -> str:
         if not self.total:
             return "-"
@@ -102,6 +102,9 @@ class ClusterShare:
         reach = 1.96 * self.std
         return max(self.value - reach, 0.0), min(self.value + reach, 1.0)
 
+    def as_plain(self) -> dict[str, float]:
+        return {"value": self.value, "std": self.std}
+
     def __str__(self) -> str:
         low, high = (f"{100 * limit:.1f}" for limit in self.interval)
         return f"{100 * self.value:.1f} ({low}-{high})"
@@ -132,9 +135,18 @@ class Rate:
         low = chi2.ppf(tail, 2 * self.count) / 2 if self.count else 0.0
         return float(low) / self.hours, float(chi2.isf(tail, 2 * self.count + 2)) / 2 / self.hours
 
+    def as_plain(self) -> dict[str, float]:
+        return {"count": self.count, "hours": self.hours}
+
     def __str__(self) -> str:
         low, high = self.interval
         return f"{self.per_hour:.2g} ({low:.2g}-{high:.2g})"
+
+
+def from_plain(plain: Mapping[str, Any]) -> Share | ClusterShare | Rate:
+    """Return the share or rate that JSON holds."""
+    kind = Share if "total" in plain else Rate if "hours" in plain else ClusterShare
+    return kind(**plain)
 
 
 @dataclass(frozen=True)
@@ -246,15 +258,15 @@ class EstimateScore:
         few = f", fewer than {MIN_TOUCHES}" if self.touches < MIN_TOUCHES else ""
         cells = {
             "touches": f"{self.touches}{few}",
-            "valid, %": str(self.valid),
-            **{f"in {100 * level:g} %": str(share) for level, share in self.coverage.items()},
-            "> 5 sigma, %": str(self.beyond_5_sigma),
+            "valid, %": self.valid,
+            **{f"in {100 * level:g} %": share for level, share in self.coverage.items()},
+            "> 5 sigma, %": self.beyond_5_sigma,
             "rms error": unit * self.rms_error,
             "median std": unit * self.median_std,
             "oracle": unit * self.oracle_std,
             "CRPS": unit * self.crps,
             "error / bound, rms": self.ratio_rms,
-            "50 / 95 / 99 %": " / ".join(f"{value:.3g}" for value in self.ratio_quantiles),
+            "50 / 95 / 99 %": self.ratio_quantiles,
         }
         if not bounds:
             for head in ("oracle", "error / bound, rms", "50 / 95 / 99 %"):
@@ -282,26 +294,6 @@ def bin_labels(values: ArrayLike, edges: Sequence[float], unit: str = "") -> NDA
     ]
     labels = np.array([f"{number}: {name} {unit}".strip() for number, name in enumerate(names, 1)])
     return np.asarray(labels[np.searchsorted(np.asarray(edges), np.asarray(values), side="right")])
-
-
-def calibration_curve(every: Estimates, levels: ArrayLike) -> list[Share]:
-    """Return for each stated probability the share of valid estimates whose region of it holds the truth."""
-    stated = every.where(every.valid).stated_levels()
-    return [Share.of_mask(stated <= level) for level in np.atleast_1d(np.asarray(levels, np.float64))]
-
-
-def draw_calibration(axes: Axes, curves: Mapping[str, Estimates]) -> None:
-    """Draw observed against stated probability, with 95 % intervals, one line each; the diagonal is right."""
-    levels = np.linspace(0.02, 0.99, 50)
-    axes.plot([0, 1], [0, 1], color="0.6", linewidth=1)
-    for name, estimates in curves.items():
-        shares = calibration_curve(estimates, levels)
-        (line,) = axes.plot(levels, [share.value for share in shares], label=name)
-        low, high = np.array([share.interval for share in shares]).T
-        axes.fill_between(levels, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-    axes.set(xlabel="stated probability of a region", ylabel="share that holds the truth", aspect="equal")
-    axes.set(xlim=(0, 1), ylim=(0, 1))
-    axes.legend(frameon=False)
 
 
 def mean_crps(some: Estimates) -> float:
@@ -371,13 +363,13 @@ class EventScore:
         """Return cells of a table, with intervals."""
         return {
             "events": self.recall.total,
-            "recall, %": str(self.recall),
-            "precision, %": str(self.precision),
+            "recall, %": self.recall,
+            "precision, %": self.precision,
             "delay, median / 95 % [ms]": " / ".join(f"{1e3 * self.delay_s(q):.0f}" for q in (0.5, 0.95))
             if len(self.delays_s)
             else "-",
             "repeated": self.repeated,
-            "false alarms per hour": str(self.false_alarms),
+            "false alarms per hour": self.false_alarms,
         }
 
 

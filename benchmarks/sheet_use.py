@@ -7,6 +7,7 @@ at a random age.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.scores import Estimates, bin_labels
+from benchmarks.scores import ClusterShare, Estimates, Share, bin_labels
 from handtouch.config import Behaviour
 from handtouch.core.sheet_force import (
     ForceReliability,
@@ -26,7 +27,7 @@ from handtouch.core.sheet_force import (
 from handtouch.core.state import TickState
 from handtouch.sheet import BankPrior
 from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
-from handtouch.simulate.worlds import DrawnWorld, SheetKind
+from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld, Family, SheetKind
 
 FloatArray = NDArray[np.float64]
 FULL_N = 5.0
@@ -205,3 +206,65 @@ def _estimates(rows: Sequence[dict[str, Any]]) -> Estimates:
             "load": column["force"],
         },
     )
+
+
+PADS, SEEDS = 8, (31, 32)
+"""Sheets of each kind, and seeds of worlds and use."""
+CUTS: dict[str, dict[str, Any]] = {
+    "no adaptation compensation": {"adaptation_share": 0.0},
+    "no creep compensation": {"creep_share": 0.0},
+    "no parameter uncertainty": {"parameter_std_fraction": 0.0},
+}
+"""Changes of what the deployment file states."""
+COMPLETE, UNLEARNED = "", "nothing learned"
+PAPER = ("S1", "S2")
+
+
+def kinds_of(world: str) -> tuple[SheetKind, ...]:
+    """Return the kinds of sheets that are measured in a world, those of the paper among them."""
+    kinds = () if world == "harsh" else tuple(SHEET_KINDS[name] for name in PAPER)
+    return (*WORLDS[world].sheets.kinds(Family.REPORTING), *kinds)
+
+
+def used(
+    world: str, part: str, hours: float, seeds: Sequence[int], pads: int, kinds: Sequence[SheetKind] = ()
+) -> Estimates:
+    """Return force errors of kinds of sheets of a world, by default all, without a part of the compensation.
+
+    `pads` sheets of each kind and seed are used side by side, by the first seed.
+    """
+    drawn = [WORLDS[world].draw(Family.REPORTING.seed(seed)) for seed in seeds]
+    sheets = [drawn_sheets(one, kind, pads) for one in drawn for kind in kinds or kinds_of(world)]
+    if part in CUTS:
+        sheets = [replace(some, behaviour=some.behaviour.model_copy(update=CUTS[part])) for some in sheets]
+    return score_use([replace(some, learns=part != UNLEARNED) for some in sheets], hours, drawn[0].seed)
+
+
+def of_kinds(world: str, every: Estimates) -> Estimates:
+    """Return the rows of the world's own kinds."""
+    own = [kind.name for kind in WORLDS[world].sheets.kinds(Family.REPORTING)]
+    return every.where(np.isin(every.columns["kind"], own or PAPER))
+
+
+def rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
+
+
+def force_row(some: Estimates, **names: str) -> dict[str, Any]:
+    """Return a row of a table: forces with and without compensation."""
+    good = some.where(some.valid)
+    inside = good.distances() <= 1.96
+    raw, error = rms(good.columns["uncompensated"]), rms(good.error)
+    pads = good.columns["pad"]
+    return {
+        **names,
+        "touches": len(some),
+        "pads": len(np.unique(some.columns["pad"])),
+        "uncompensated, N": raw,
+        "compensated, N": error,
+        "ratio": error / raw,
+        "in 95 %": Share.of_mask(inside),
+        "by pad": ClusterShare.of_mask(inside, pads) if len(np.unique(pads)) > 1 else None,
+        "median width, N": 2 * 1.96 * float(np.median(np.sqrt(good.covariance))) if len(good) else math.nan,
+        "valid, %": 100 * float(some.valid.mean()) if len(some) else None,
+    }

@@ -1,21 +1,22 @@
-"""Count false positives: hours of hands without faults in each world, mostly idle, now and then in use.
+"""False positives of a hand in ordinary use: hours of hands without faults in each world.
 
-Prints its tables and writes docs/benchmarks/alarms.md and alarms.json. `--hours N` in each world, instead
-of those for 500 pad-hours in `default`. `--quick` plays one of each and writes nothing; `--journal FILE`
-keeps what was played: an interrupted run continues from it.
+Each hour is on a hand of its own: the shipped one, drawn in each [world](../worlds.md) for seeds of the
+reporting family. The deployment file describes sheets as their builder would; parts, sheets, drift of zeros,
+temperature and supply are hidden. As a hand's week is, it mostly rests; between, bouts of 10 to 180 s: single
+touches and slides, things taken and put down, long grasps, wipes, hot cups (10 to 30 K), two objects on a
+pad. Sampled at 100 Hz in use and 5 s longer, and at 20 Hz at rest, as the daemon's own idling does. Each
+diagnosed fault counts, as no pad has one. Wet objects are in the [episodes](diagnose.md).
 """
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 
-from benchmarks.page import made_by, options, output_folder, progress, table
+from benchmarks.page import Report, options, progress
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy: matrices are small, workers many
 
-import platform
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -217,34 +218,36 @@ def play(task: tuple[str, int]) -> dict[str, Any]:
     model = DiagnosisModel.from_deployment(hour.deployment, "right")
     diagnosis = HandDiagnostics(model, tables=_TABLES)
     for block in hour.blocks():
-        for f in diagnosis.process_block(block):
-            if f.is_fault and f.until_ns is None:
-                values = {key: float(value) for key, value in f.values.items()}
-                alarms.append(
-                    {"kind": f.kind.value, "link": f.link, "t_s": f.published.since_ns * 1e-9, **values}
-                )
+        found = [
+            fault for fault in diagnosis.process_block(block) if fault.is_fault and fault.until_ns is None
+        ]
+        alarms += [
+            {
+                "world": world,
+                "seed": seed,
+                "kind": f.kind.value,
+                "link": f.link,
+                "s": f.published.since_ns * 1e-9,
+            }
+            for f in found
+        ]
     return {
-        "world": world, "seed": seed, "alarms": alarms, "bouts": dict(hour.bouts),
+        "world": world, "alarms": alarms, "bouts": dict(hour.bouts),
         "touches": len(hour.touches), "busy_s": sum(end - begin for begin, end in hour.busy),
     }  # fmt: skip
 
 
-def run(hours: Mapping[str, int], workers: int, journal: Path | None) -> list[dict[str, Any]]:
-    """Play hours by world; those in a journal aren't played again."""
-    lines = journal.read_text().splitlines() if journal and journal.exists() else []
-    every = [(world, seed) for seed in range(max(hours.values())) for world in WORLDS if seed < hours[world]]
-    known = {(r["world"], r["seed"]): r for r in map(json.loads, lines)}
-    found = {task: known[task] for task in every if task in known}
-    tasks = [task for task in every if task not in found]
+def run(hours: Mapping[str, int], workers: int) -> list[dict[str, Any]]:
+    """Play hours by world."""
+    tasks = [(world, seed) for seed in range(max(hours.values())) for world in WORLDS if seed < hours[world]]
+    found = []
     with multiprocessing.get_context("fork").Pool(workers) as pool:
         for result in pool.imap_unordered(play, tasks):
-            found[result["world"], result["seed"]] = result
-            if journal:
-                with journal.open("a") as file:
-                    file.write(json.dumps(result) + "\n")
-            alarms = sum(len(r["alarms"]) for r in found.values())
-            progress(f"{len(found)} of {len(every)} hours, {alarms} false positives")
-    return [found[task] for task in every]
+            found.append(result)
+            progress(
+                f"{len(found)} of {len(tasks)} hours, {sum(len(r['alarms']) for r in found)} false positives"
+            )
+    return found
 
 
 def counted(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -256,7 +259,7 @@ def counted(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         kinds = Counter(alarm["kind"] for r in own for alarm in r["alarms"])
         for kind, count in [*kinds.most_common(), ("all", kinds.total())]:
             row = {"world": world, "diagnosis": kind, "pad-hours": PADS * hours, "false positives": count}
-            rows.append({**row, "per 100 pad-hours": str(Rate(count, PADS * hours / 100))})
+            rows.append({**row, "per 100 pad-hours": Rate(count, PADS * hours / 100)})
     return rows
 
 
@@ -274,44 +277,14 @@ def used(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--hours", type=int, help="in each world")
-    parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--journal", type=Path, help="file to keep results in")
     args = parser.parse_args()
     hours = 1 if args.quick else args.hours
-    by_world = WORLD_HOURS if hours is None else dict.fromkeys(WORLDS, hours)
-    results = run(by_world, args.workers, args.journal)
-    tables = {
-        "False positives": (
-            "Each diagnosed fault counts, as no pad has one. Rates with Poisson's 95 % interval.",
-            counted(results),
-        ),
-        "Use of the hand": ("Bouts of 10 to 180 s.", used(results)),
-    }
-    page = [line for title, (note, rows) in tables.items() for line in table(title, note, rows)]
-    machine = (
-        f"{os.cpu_count()} x {platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
-    )
-    head = [
-        "# False positives of a hand in ordinary use", "",
-        f"{made_by()}; {machine}.", "",
-        f"{len(results)} hours, each on a hand of its own: the shipped one, drawn in each "
-        "[world](../worlds.md) for seeds of the reporting family. The deployment file describes sheets as "
-        "their builder would; parts, sheets, drift of zeros, temperature and supply are hidden. As a "
-        "hand's week is, it mostly rests; between, single touches and slides, things taken and put down, "
-        f"long grasps, wipes, hot cups (10 to 30 K), two objects on a pad. Sampled at {BUSY_HZ} Hz in "
-        f"use and {LINGER_S:g} s longer, and at {IDLE_HZ} Hz at rest, as the daemon's own idling does. Wet "
-        "objects are in the [episodes](diagnose.md).", "",
-    ]  # fmt: skip
-    out = output_folder(args.quick)
-    (out / "alarms.md").write_text("\n".join([*head, *page]))
-    record = {
-        "machine": machine,
-        "tables": {title: rows for title, (_, rows) in tables.items()},
-        "alarms": [
-            {"world": r["world"], "seed": r["seed"], **alarm} for r in results for alarm in r["alarms"]
-        ],
-    }
-    (out / "alarms.json").write_text(json.dumps(record, indent=1) + "\n")
+    results = run(WORLD_HOURS if hours is None else dict.fromkeys(WORLDS, hours), os.cpu_count() or 1)
+    report = Report(args.quick, hours=len(results))
+    report.table("False positives", counted(results))
+    report.table("Each of them", [alarm for r in results for alarm in r["alarms"]])
+    report.table("Use of the hand", used(results))
+    report.keep()
 
 
 if __name__ == "__main__":

@@ -1,35 +1,141 @@
-"""Soak test of the daemon's sockets: clients that stall, flood and send garbage beside well-behaved ones.
+"""Hostile clients: a daemon whose clients stall, flood and send garbage beside well-behaved ones.
 
-50 clients without keys over TCP, 15 of them hostile; then the same well-behaved ones beside processes that
-use as much CPU and don't connect. Status 1 if tick rate or p99 differ by more than 10 %, or memory grows.
-ARGS="--minutes 2" sets how long each of the two takes; default 10.
+A daemon without keys, its four endpoints over TCP on loopback, and a simulated hand of 15 pads at 200 Hz; 35
+well-behaved subscribers to `hand/*` beside 15 hostile clients: 5 read nothing; 5 subscribe without pause, 3
+of them to prefixes without topic, and connect again when they are disconnected; 3 request `status`,
+`snapshot` and `tare` with 100 requests under way each; 2 connect and send random bytes to all endpoints, with
+200 connections open each. Then the same subscribers beside processes that use as much processor time as each
+hostile client did and don't connect. Hostile clients and burners run 10 nice levels below the others, as
+`handtouch@.service` puts the daemon before ordinary processes. Latency is from SYNC to the message in the
+subscriber. *Others*: processors used by what doesn't belong to the test: the two rows can be compared only
+where these agree. A checker beside the other clients knows the scenario, and when the daemon died: nothing
+may contradict it. No touched pad is shown as clear, nor the reverse, from 0.3 s after a change on; what isn't
+sampled is unknown, also in sums; no frame is older than its limit; a dead daemon is known within 50 ms.
+ARGS="--minutes 2" sets how long each of the two takes.
 """
 
 from __future__ import annotations
 
-import json
+import contextlib
 import multiprocessing
 import os
+import random
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
+import zmq
 
-from benchmarks.bench_latency import PORT, descriptors, in_own_network, machine, on_loopback, resident_mb
-from benchmarks.client_checks import CHECKED, Truth, longest_age_s, watch_hand, watch_ros
+from benchmarks.client_checks import Truth, longest_age_s, watch_hand, watch_ros
 from benchmarks.cycled_processes import scenario_text
-from benchmarks.hostile_clients import HOSTILE, burner, cpu_seconds, hostile_client
-from benchmarks.page import ROOT, made_by, options, output_folder, progress, table
+from benchmarks.page import ROOT, Report, options, progress
+from benchmarks.served_hand import PORT, descriptors, in_own_network, on_loopback, processor_s, resident_mb
 from handtouch.client import connect, request
 from handtouch.config import load
+
+Endpoints = Mapping[str, str]
+SUBSCRIPTIONS = 30_000
+REQUESTS_UNDER_WAY = 100
+CONNECTIONS_HELD = 200
+BURN_PERIOD_S = 0.02
+
+
+def stall(endpoints: Endpoints, stop: Event, seed: int) -> None:
+    """Subscribe to everything and read nothing."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
+        subscriber.setsockopt(zmq.LINGER, 0)
+        subscriber.setsockopt(zmq.RCVHWM, 1)
+        subscriber.subscribe("")
+        subscriber.connect(endpoints["live" if seed % 2 else "complete"])
+        stop.wait()
+
+
+def flood_subscriptions(endpoints: Endpoints, stop: Event, seed: int) -> None:
+    """Subscribe to other prefixes without pause, or to the same over and over."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
+        subscriber.setsockopt(zmq.LINGER, 0)
+        subscriber.setsockopt(zmq.SNDHWM, 0)
+        subscriber.setsockopt(zmq.RECONNECT_IVL, 10)
+        subscriber.connect(endpoints["live" if seed % 2 else "complete"])
+        number = 0
+        while not stop.is_set():
+            prefixes = [f"contact/{seed}/{number + k}" if seed % 3 else "hand/" for k in range(100)]
+            for prefix in prefixes:
+                subscriber.subscribe(prefix)
+            if number >= SUBSCRIPTIONS or not seed % 3:
+                for prefix in prefixes:
+                    subscriber.unsubscribe(prefix)
+                time.sleep(0.001)  # with more, it would flood only its own memory
+            number += 100
+            while subscriber.poll(0):
+                subscriber.recv_multipart()
+
+
+def flood_control(endpoints: Endpoints, stop: Event, seed: int) -> None:
+    """Ask for the status without pause, and for a snapshot or a tare now and then."""
+    commands: list[dict[str, Any]] = [{"command": "status"}] * 20 + [
+        {"command": "snapshot"},
+        {"command": "tare", "pads": ["*"]},
+    ]
+    draw, under_way = random.Random(seed), 0
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        dealer.setsockopt(zmq.LINGER, 0)
+        dealer.connect(endpoints["control"])
+        while not stop.is_set():
+            while under_way < REQUESTS_UNDER_WAY:
+                dealer.send_multipart([b"", msgpack.packb({"v": 1, **draw.choice(commands)})])
+                under_way += 1
+            while dealer.poll(10 if under_way == REQUESTS_UNDER_WAY else 0):
+                dealer.recv_multipart()
+                under_way -= 1
+
+
+def send_garbage(endpoints: Endpoints, stop: Event, seed: int) -> None:
+    """Connect to every endpoint in turn, send random bytes, and hold many connections open."""
+    draw, held = random.Random(seed), []
+    ports = [int(endpoint.rpartition(":")[2]) for endpoint in endpoints.values()]
+    while not stop.is_set():
+        with contextlib.suppress(OSError):
+            connection = socket.create_connection(("127.0.0.1", draw.choice(ports)), timeout=1)
+            held.append(connection)
+            connection.settimeout(0.1)
+            connection.sendall(draw.randbytes(draw.choice([20, 200, 2000, 20_000])))
+        if len(held) > CONNECTIONS_HELD:
+            held.pop(0).close()
+
+
+HOSTILE: dict[str, tuple[int, Callable[[Endpoints, Event, int], None]]] = {
+    "stalled": (5, stall),
+    "flood subscriptions": (5, flood_subscriptions),
+    "flood control": (3, flood_control),
+    "send garbage": (2, send_garbage),
+}
+"""Kind -> number of clients, and what each does until it is stopped"""
+
+
+def hostile_client(kind: str, endpoints: Endpoints, stop: Event, seed: int) -> None:
+    """Run a client of a kind."""
+    HOSTILE[kind][1](endpoints, stop, seed)
+
+
+def burner(share: float, stop: Event) -> None:
+    """Use a share of one processor."""
+    while not stop.is_set():
+        begin_s = time.process_time()
+        period_end_s = time.monotonic() + BURN_PERIOD_S
+        while time.process_time() - begin_s < share * BURN_PERIOD_S:
+            pass
+        time.sleep(max(0.0, period_end_s - time.monotonic()))
+
 
 WELL_BEHAVED = 35
 READERS_PER_PROCESS = 7
@@ -43,8 +149,6 @@ process, whatever the daemon does"""
 MAX_RATIO = 1.1
 MAX_GROWTH_MB = 5.0
 """Growth after a third of the time; until then the queues of stalled subscribers fill"""
-HEAD = """| beside | ticks/s | overruns | p50, ms | p99, ms | messages | lost | status | MB | third | last |
-| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""
 
 
 def read(endpoint: str, count: int, stop: Event, measure: Event, results: Any) -> None:
@@ -116,20 +220,20 @@ def phase(
         time.sleep(JOINING_S)
         measure.set()
         before = request("status", endpoint=endpoints["control"], timeout_s=PATIENCE_S)["service"]
-        used_s = [cpu_seconds(other) for other in pids]
+        used_s = [processor_s(other) for other in pids]
         memory_mb, begin_s = [], time.monotonic()
         busy_s = outside_seconds([*own, *reader_pids, *pids])
         while (passed_s := time.monotonic() - begin_s) < seconds:
-            memory_mb.append((passed_s, resident_mb(pid)))
+            memory_mb.append(resident_mb(pid))
             if len(memory_mb) % (SAMPLES_OF_MEMORY // 5) == 1:
-                progress(f"{passed_s:.0f} of {seconds:.0f} s, {memory_mb[-1][1]:.0f} MB")
+                progress(f"{passed_s:.0f} of {seconds:.0f} s, {memory_mb[-1]:.0f} MB")
             time.sleep(seconds / SAMPLES_OF_MEMORY)
         busy_s = outside_seconds([*own, *reader_pids, *pids]) - busy_s
         asked_s = time.monotonic()
         after = request("status", endpoint=endpoints["control"], timeout_s=PATIENCE_S)["service"]
         answered_s = time.monotonic() - asked_s
         took_s = (after["t_ns"] - before["t_ns"]) * 1e-9
-        shares = [(cpu_seconds(p) - used) / took_s for p, used in zip(pids, used_s, strict=True)]
+        shares = [(processor_s(p) - used) / took_s for p, used in zip(pids, used_s, strict=True)]
         stop_readers.set()
         for _ in range(count):
             times, missed = results.get(timeout=60)
@@ -138,19 +242,22 @@ def phase(
     rejected = {cause: n - before["rejected"].get(cause, 0) for cause, n in after["rejected"].items()}
     episodes = [sum(service["congestion_episodes"].values()) for service in (before, after)]
     return {
-        "ticks_hz": (after["ticks"] - before["ticks"]) / took_s,
-        "overruns": after["overruns"] - before["overruns"],
-        "p50_ms": 1e3 * float(np.percentile(late_s, 50)),
-        "p99_ms": 1e3 * float(np.percentile(late_s, 99)),
-        "messages": len(late_s),
-        "lost": lost,
-        "status_s": answered_s,
-        "congestion_episodes": episodes[1] - episodes[0],
+        "row": {
+            "ticks/s": (after["ticks"] - before["ticks"]) / took_s,
+            "overruns": after["overruns"] - before["overruns"],
+            "p50, ms": 1e3 * float(np.percentile(late_s, 50)),
+            "p99, ms": 1e3 * float(np.percentile(late_s, 99)),
+            "messages": len(late_s),
+            "lost": lost,
+            "status, ms": 1e3 * answered_s,
+            "congestion": episodes[1] - episodes[0],
+            "MB": memory_mb[0],
+            "after a third": memory_mb[len(memory_mb) // 3],
+            "at the end": memory_mb[-1],
+            "others": busy_s / seconds,
+        },
         "rejected": {cause: n for cause, n in rejected.items() if n},
-        "memory_mb": memory_mb,
         "shares": shares,
-        "outside": busy_s / seconds,
-        "late": {part: n - before["loop"]["late"].get(part, 0) for part, n in after["loop"]["late"].items()},
     }
 
 
@@ -158,7 +265,7 @@ def outside_seconds(pids: list[int]) -> float:
     """Return the CPU time that all processes of the machine but these have used."""
     user, nice, system = map(int, Path("/proc/stat").read_text().split()[1:4])
     total_s = (user + nice + system) / os.sysconf("SC_CLK_TCK")
-    return total_s - sum(cpu_seconds(pid) for pid in [*pids, os.getpid()])
+    return total_s - sum(processor_s(pid) for pid in [*pids, os.getpid()])
 
 
 def over_tcp(config: Path) -> Path:
@@ -216,7 +323,6 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
         for kind in HOSTILE
     }
     return {
-        "seconds": seconds,
         "hostile": hostile,
         "control": control,
         "left": left,
@@ -226,85 +332,31 @@ def measure(config: Path, seconds: float) -> dict[str, Any]:
     }
 
 
-def verdicts(results: dict[str, Any]) -> dict[str, tuple[float, bool]]:
-    """Return each quantity that is limited, and whether it is within its limit."""
-    hostile, control = results["hostile"], results["control"]
-    rate, tail = hostile["ticks_hz"] / control["ticks_hz"], hostile["p99_ms"] / control["p99_ms"]
-    memory = hostile["memory_mb"]
-    growth = memory[-1][1] - memory[len(memory) // 3][1]
-    return {
-        "tick rate, beside hostile clients / beside burners": (rate, rate >= 1 / MAX_RATIO),
-        "p99, beside hostile clients / beside burners": (tail, tail <= MAX_RATIO),
-        "memory, last two thirds, MB": (growth, growth <= MAX_GROWTH_MB),
-        "contradictions of the truth": (wrong := len(results["contradictions"]), wrong == 0),
-    }
-
-
-def page_of(results: dict[str, Any]) -> str:
-    """Return the page."""
-    rows = []
-    for name, title in (("hostile", "15 hostile clients"), ("control", "burners")):
-        row = results[name]
-        memory = [mb for _, mb in row["memory_mb"]]
-        rows.append(
-            f"| {title} | {row['ticks_hz']:.1f} | {row['overruns']} "
-            f"| {row['p50_ms']:.1f} | {row['p99_ms']:.1f} "
-            f"| {row['messages']} | {row['lost']} | {1e3 * row['status_s']:.0f} | {memory[0]:.0f} "
-            f"| {memory[len(memory) // 3]:.0f} | {memory[-1]:.0f} |"
-        )
-    judged = [
-        f"| {name} | {value:.3g} | {'yes' if within else '**no**'} |"
-        for name, (value, within) in verdicts(results).items()
-    ]
-    used = ", ".join(f"{kind} {share:.2f}" for kind, share in results["used"].items())
-    rejected = ", ".join(f"`{cause}` {n}" for cause, n in results["hostile"]["rejected"].items())
-    return f"""# Hostile clients
-
-A daemon without keys, its four endpoints over TCP on loopback, and a simulated hand of 15 pads at 200 Hz;
-{WELL_BEHAVED} well-behaved subscribers to `hand/*` beside 15 hostile clients for
-{results["seconds"] / 60:.2g} min: 5 read nothing; 5 subscribe without pause, 3 of them
-to prefixes without topic, and connect again when they
-are disconnected; 3 request `status`, `snapshot` and `tare` with 100 requests under way each; 2 connect and
-send random bytes to all endpoints, with 200 connections open each. Then the same subscribers beside processes
-that use as much CPU as each hostile client did and don't connect (processors: {used}).
-Hostile clients and burners run {ORDINARY_NICE} nice levels below the others, as `handtouch@.service`
-puts the daemon before ordinary processes.
-Latency is from SYNC to the message in the subscriber.
-{machine()}; load average when it ended {os.getloadavg()[0]:.1f}. Processes that don't belong to the test used
-{results["hostile"]["outside"]:.2f} processors beside the hostile clients,
-{results["control"]["outside"]:.2f} beside the burners: the two can be compared only where these agree.
-
-{HEAD}
-{chr(10).join(rows)}
-
-| | | within its limit |
-| --- | --- | --- |
-{chr(10).join(judged)}
-
-Rejected meanwhile: {rejected}; {results["hostile"]["congestion_episodes"]} congestion episodes.
-{chr(10).join(table("What clients showed", CHECKED, results["checked"]))}
-{LEAVING_S:.0f} s after the hostile clients left: {results["left"]["memory_mb"]:.0f} MB,
-{results["left"]["descriptors"]} descriptors.
-
-{made_by()}.
-"""
-
-
 def main() -> int:
     parser = options(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     asked = parser.parse_args()
     in_own_network()
+    report = Report(asked.quick, minutes=asked.minutes)
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         config = over_tcp(on_loopback(Path(folder), PORT + 2))
         results = measure(config, 15.0 if asked.quick else 60 * asked.minutes)
-    out = output_folder(asked.quick)
-    page = page_of(results)
-    print(page)
-    print({name: results[name]["late"] for name in ("hostile", "control")})
-    (out / "soak_clients.json").write_text(json.dumps(results, indent=1) + "\n")
-    (out / "soak_clients.md").write_text(page)
-    return int(not all(within for _, within in verdicts(results).values()))
+    hostile, control = results["hostile"]["row"], results["control"]["row"]
+    report.table("Service", [{"beside": "15 hostile clients", **hostile}, {"beside": "burners", **control}])
+    report.table("Processors of the hostile clients", [results["used"]])
+    report.table("What clients showed", results["checked"])
+    report.table("Contradictions of the truth", [{"what": text} for text in results["contradictions"]])
+    report.table("Rejected", [results["hostile"]["rejected"]])
+    report.table(f"{LEAVING_S:.0f} s after they left", [results["left"]])
+    beside = "beside hostile clients / beside burners"
+    rate, tail = (hostile[key] / control[key] for key in ("ticks/s", "p99, ms"))
+    report.limit(f"tick rate, {beside}", rate, 1 / MAX_RATIO, at_least=True)
+    report.limit(f"p99, {beside}", tail, MAX_RATIO)
+    report.limit(
+        "memory, last two thirds", hostile["at the end"] - hostile["after a third"], MAX_GROWTH_MB, "MB"
+    )
+    report.limit("contradictions of the truth", len(results["contradictions"]), 0)
+    return int(not report.keep())
 
 
 if __name__ == "__main__":

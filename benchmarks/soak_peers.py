@@ -1,11 +1,16 @@
-"""A hand beside a second master, floods, pauses and an interface that goes down: no healthy node is lost.
+"""A hand beside other masters, floods, pauses and failing interfaces: no healthy node is lost.
 
-On the host: 15 simulated nodes, master and SYNC on an injected bus with the program's own clock, --hours of
-it. Under `tests/socketcan/vcan-run`: daemon and nodes as processes on vcan0, --minutes of real time; with
---master another stack's NMT master is one of the acts. One act follows another, each with a time to recover.
-A node may leave OPERATIONAL only where another master commanded it, and be lost only while the interface is
-down, with the bus as the reason; after each act all nodes must be operational again. Writes
-docs/benchmarks/soak_peers.{md,json}; exit status 1 if a promise is broken.
+On the host: 15 simulated nodes, master and SYNC on an injected bus with the program's own clock. Under
+`tests/socketcan/vcan-run`: daemon and nodes as processes on vcan0, in real time. Acts follow one another,
+each with a time to recover: NMT commands of another master (`nmt`), another SYNC producer (`sync`), SDO
+client (`sdo`), unknown identifiers (`flood`), EMCY messages and frames of wrong length of the hand's nodes
+(`emcy`, `short`), a pause of the host of 0.3, 0.6 or 2 s (`pause`), an interface that is down for up to 5 s
+(`down`), and with --master coctl of Lely's CANopen stack (`gateway`): it boots as NMT master with a heartbeat
+of its own, resets all nodes, commands some and reads one. Nodes may leave OPERATIONAL only by `nmt`,
+`gateway` and `down`; a promise is broken by a node that is lost or faulted, that leaves it for another
+reason, or that doesn't return. In the guest all processes share one processor: an event is counted apart (*no
+processor*) if most nodes sent nothing in the two seconds before, by the kernel's stamps of their frames, and
+its reason names host, bus or silence. Exit status 1 if a promise is broken.
 """
 
 from __future__ import annotations
@@ -13,16 +18,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import itertools
-import json
 import random
 import re
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, ClassVar
@@ -31,13 +36,13 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bench_receive_path import VCAN
-from benchmarks.page import made_by, options, output_folder, progress
-from benchmarks.peer_verdicts import Starvation, Verdicts
+from benchmarks.page import Report, options, progress
+from benchmarks.served_hand import VCAN
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
 from handtouch.canbus.bus.loop_pause import LoopPause
 from handtouch.canbus.bus.port import Port
+from handtouch.canbus.bus.receivers import grow_receive_buffer
 from handtouch.canbus.bus.router import CanFrame, Router
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes import master as master_module
@@ -50,6 +55,98 @@ from handtouch.config import Bus, shipped
 from handtouch.core.slab import Slab
 from handtouch.device import DeviceBus
 
+GATEWAY = "gateway"
+"""Act of a program of another stack, which the injected bus can't have."""
+ACCUSED = ("absent", "faulted")
+COMMON_CAUSE = re.compile(
+    "as from every|no SYNC on bus|bus can|no answer within|are being checked|settings can't be read"
+)
+"""Reasons that name the host or the bus, report silence without a cause, or wait for a check."""
+MISSED_PERIODS, RECENT_S = 2.5, 2.0
+SAMPLE_BYTES = 8
+
+
+class Starvation(threading.Thread):
+    """Times at which most nodes of vcan0 sent no sample, by the kernel's stamps: their process didn't run."""
+
+    def __init__(self, ids: Sequence[int], period_s: float) -> None:
+        super().__init__(daemon=True)
+        self._limit_s = MISSED_PERIODS * period_s
+        filters = [{"can_id": 0x280, "can_mask": 0x780}]
+        self._bus = can.Bus(interface="socketcan", channel="vcan0", can_filters=filters)
+        grow_receive_buffer(self._bus.socket)  # type: ignore[attr-defined]
+        now_s = time.time()
+        self._newest_s = dict.fromkeys(ids, now_s)
+        self._gaps: deque[tuple[float, float, int]] = deque(maxlen=100_000)  # from, to, node id
+        self._ended = threading.Event()
+
+    def run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                message = self._bus.recv(0.1)
+            except can.CanOperationError:  # the interface is down
+                self._ended.wait(0.05)
+                continue
+            node_id = message.arbitration_id & 0x7F if message is not None else 0
+            if message is None or node_id not in self._newest_s or message.dlc != SAMPLE_BYTES:
+                continue
+            before_s, self._newest_s[node_id] = self._newest_s[node_id], message.timestamp
+            if message.timestamp - before_s > self._limit_s:
+                self._gaps.append((before_s, message.timestamp, node_id))
+
+    def was_recent(self, t_s: float) -> bool:
+        """Return True if most nodes had a gap in the last seconds before a time (`time.time`)."""
+        silent = {
+            node for since_s, to_s, node in list(self._gaps) if since_s <= t_s and to_s >= t_s - RECENT_S
+        }
+        silent |= {node for node, newest_s in self._newest_s.items() if t_s - newest_s > self._limit_s}
+        return 2 * len(silent) > len(self._newest_s)
+
+    def close(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self.join()
+        self._bus.shutdown()
+
+
+class Verdicts:
+    """Counts acts and node events, and keeps what must not happen."""
+
+    def __init__(self) -> None:
+        self.starved: Counter[str] = Counter()  # events of nodes without processor time, by act
+        self.acts: Counter[str] = Counter()
+        self.left: Counter[str] = Counter()  # nodes that left OPERATIONAL, by act
+        self.broken: list[str] = []
+
+    def judge(self, act: str, node: str, old: str, new: str, reason: str, was_starved: bool = False) -> None:
+        """Judge a node's event during an act or its recovery."""
+        left = old == "operational" != new
+        self.left[act] += left
+        if act == "down" and (new == "absent" or old == "absent") and "bus can" in reason:
+            return
+        if new in ACCUSED or (act not in ("nmt", GATEWAY, "down") and (left or new == "stale")):
+            self.record(act, f"{node}: {old} -> {new}: {reason}", was_starved and COMMON_CAUSE.search(reason))
+
+    def record(self, act: str, what: str, excused: object) -> None:
+        """Record what may happen only for want of processor time."""
+        if excused:
+            self.starved[act] += 1
+        else:
+            self.broken.append(f"{act}: {what}")
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each act."""
+        return [
+            {
+                "act": act,
+                "number": number,
+                "left OPERATIONAL": self.left[act],
+                "no processor": self.starved[act],
+            }
+            for act, number in self.acts.items()
+        ]
+
+
 MS, SECOND = 1_000_000, 1_000_000_000
 NODES = range(1, 16)
 PERIOD_NS, STEP_NS = 10 * MS, 5 * MS
@@ -57,8 +154,6 @@ RECOVERY_S = 10.0
 WORKER_POLL_S = 0.0001
 ACTS = ("nmt", "sync", "sdo", "flood", "emcy", "short", "pause", "down", "nothing")
 COMMANDS = (cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, cia301.RESET_COMMUNICATION, cia301.RESET_NODE)
-GATEWAY = "gateway"
-"""Act of a program of another stack, which the injected bus can't have."""
 GUEST_PERIOD_MS, GUEST_HEARTBEAT_TIMEOUT_MS = 50, 1000
 
 
@@ -211,14 +306,14 @@ def _sampler(counts: NDArray[np.int64]) -> Callable[[int], NDArray[np.int64]]:
     return lambda _: counts
 
 
-def injected(hours: float) -> dict[str, Any]:
+def injected(hours: float) -> Verdicts:
     """Run the acts for so many hours of the injected clock."""
     master_module.ThreadPoolExecutor = CountedWorkers  # type: ignore[attr-defined]
     sdo.SDO_TIMEOUT_S = 0.05  # of real time, while the injected clock stands still
     hand, verdicts, generator = InjectedHand(), Verdicts(), random.Random(1)
     list(hand.run(2.0))
     assert hand.is_operational, hand.master.status()
-    began_s, end_ns = time.monotonic(), hand.now_ns + round(hours * 3600 * SECOND)
+    end_ns = hand.now_ns + round(hours * 3600 * SECOND)
     for act in itertools.cycle(ACTS):
         if hand.now_ns >= end_ns:
             break
@@ -235,7 +330,7 @@ def injected(hours: float) -> dict[str, Any]:
         if not hand.is_operational:
             verdicts.broken.append(f"{act}: not operational after {RECOVERY_S} s")
     hand.master.stop(hand.now_ns)
-    return verdicts.figures(f"{hours:g} h, injected clock", time.monotonic() - began_s)
+    return verdicts
 
 
 def _act_injected(hand: InjectedHand, act: str, generator: random.Random) -> Iterator[NodeEvent]:
@@ -279,7 +374,7 @@ def _down(hand: InjectedHand, seconds: float) -> Iterator[NodeEvent]:
     hand.bus.is_down = False
 
 
-def socketcan(minutes: float, gateway: Path | None) -> dict[str, Any]:
+def socketcan(minutes: float, gateway: Path | None) -> Verdicts:
     """Run the acts on vcan0 for so many minutes, against the daemon's own process."""
     verdicts, generator = Verdicts(), random.Random(1)
     with tempfile.TemporaryDirectory() as name:
@@ -318,7 +413,7 @@ def _run_guest(
     generator: random.Random,
     minutes: float,
     gateway: Path | None,
-) -> dict[str, Any]:
+) -> Verdicts:
     endpoint = f"ipc://{folder}/control"
     pads = _wait_operational(endpoint, 300.0)
     ids = [pad["node_id"] for pad in pads]
@@ -352,7 +447,7 @@ def _run_guest(
                 if old != message.node_state:
                     starved = starvation.was_recent(since_boot_s + message.t_ns * 1e-9)
                     verdicts.judge(act, message.link, old, message.node_state, message.reason, starved)
-    return verdicts.figures(f"{minutes:g} min, vcan0", time.monotonic() - began_s)
+    return verdicts
 
 
 def _act_guest(
@@ -441,41 +536,6 @@ def _wait_operational(endpoint: str, seconds: float) -> list[dict[str, Any]]:
         time.sleep(0.2)
 
 
-def report(name: str, figures: dict[str, Any], out: Path) -> None:
-    """Add the figures to those of earlier runs."""
-    path = out / "soak_peers.json"
-    runs: dict[str, Any] = (json.loads(path.read_text()) if path.exists() else {}) | {name: figures}
-    path.write_text(json.dumps(runs, indent=1) + "\n")
-    lines = [
-        "# A hand beside other masters, floods and failing interfaces",
-        "",
-        "Acts follow one another, each with a time to recover: NMT commands of another master (`nmt`),",
-        "another SYNC producer (`sync`), SDO client (`sdo`), unknown identifiers (`flood`), EMCY messages",
-        "and frames of wrong length of the hand's nodes (`emcy`, `short`), a pause of the host of 0.3,",
-        "0.6 or 2 s (`pause`), an interface that is down for up to 5 s (`down`), and coctl of Lely's",
-        "CANopen stack (`gateway`): it boots as NMT master with a heartbeat of its own, resets all nodes,",
-        "commands some and reads one. Nodes may leave OPERATIONAL only by `nmt`, `gateway` and `down`; a",
-        "promise is broken by a node that is lost or faulted, that leaves it for another reason, or that",
-        "doesn't return. In the guest all processes share one",
-        "processor: an event is counted apart (`no processor`) if most nodes sent nothing in the two seconds",
-        "before, by the kernel's stamps of their frames, and its reason names host, bus or silence.",
-        f"{made_by()}.",
-        "",
-        "| length | duration, s | acts | left OPERATIONAL | no processor | broken promises | machine |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for run in runs.values():
-        left = ", ".join(f"{act} {count}" for act, count in run["left_operational"].items()) or "none"
-        lines.append(
-            f"| {run['length']} | {run['seconds']} | {sum(run['acts'].values())} | {left} "
-            f"| {sum(run['starved'].values())} "
-            f"| {len(run['broken'])} | {run['machine']} |"
-        )
-    skipped = [f"{run['length']}: skipped {run['skipped']}." for run in runs.values() if "skipped" in run]
-    lines += ["", *skipped] if skipped else []
-    (out / "soak_peers.md").write_text("\n".join(lines) + "\n")
-
-
 def main() -> int:
     parser = options(__doc__)
     parser.add_argument("--hours", type=float, default=2.0, help="of the injected clock (default: 2)")
@@ -484,18 +544,16 @@ def main() -> int:
         "--master", type=Path, help="path of coctl of Lely's CANopen stack, a second NMT master on vcan0"
     )
     arguments = parser.parse_args()
-    out = output_folder(arguments.quick)
+    report = Report(arguments.quick, "socketcan" if VCAN.exists() else "injected")
     if VCAN.exists():
-        minutes = 1.0 if arguments.quick else arguments.minutes
-        name, figures = "socketcan", socketcan(minutes, arguments.master)
+        verdicts = socketcan(1.0 if arguments.quick else arguments.minutes, arguments.master)
     else:
-        name, figures = "injected", injected(0.02 if arguments.quick else arguments.hours)
-    if not VCAN.exists() or not arguments.master:
-        need = "no --master PATH" if VCAN.exists() else "no vcan0; run it by tests/socketcan/vcan-run"
-        figures["skipped"] = f"act {GATEWAY}: {need}"
-    print(json.dumps(figures, indent=1))
-    report(name, figures, out)
-    return int(bool(figures["broken"]))
+        verdicts = injected(0.02 if arguments.quick else arguments.hours)
+    skipped = [] if VCAN.exists() and arguments.master else [{"act": GATEWAY, "number": "skipped"}]
+    report.table("Acts", [*verdicts.rows(), *skipped])
+    report.table("Broken promises", [{"promise": line} for line in verdicts.broken[:20]])
+    report.limit("broken promises", len(verdicts.broken), 0)
+    return int(not report.keep())
 
 
 if __name__ == "__main__":

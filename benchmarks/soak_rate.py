@@ -1,22 +1,16 @@
-"""Soak test of many pads at 1 kHz through the real daemon in one process; rate limits; memory over an hour.
+"""Sustained rates of one core: many pads at 1 kHz through the real daemon, and its memory.
 
-The daemon's hot loop runs in a thread, on in-process buses of 8 pads each with their bounded queues. Its
-nodes are simulated ones until they are booted; then each SYNC is answered with messages made before, a tenth
-of the pads touched by sliding contacts, while it is sent: their share of a core is measured separately.
-With --socket the nodes are a process of their own, which answers over pairs of sockets that carry
-`struct can_frame`, PADS_PER_SOCKET pads each: the daemon reads them as it does SocketCAN.
-
---minutes says how long the run of 60 pads at 1 kHz takes, --hours how much of the memory run, in which
-samples of 15 pads at 1 kHz go through pipeline and publisher as fast as they can, contacts
-begin and end, and their stamps are the clock. --trial runs a short version of all parts and writes nothing.
-Writes docs/benchmarks/soak_rate.{md,json}; exit status 1 if a sample was lost or the memory grows.
+The daemon's hot loop runs in a thread with its nodes, eight pads to an in-process bus with a bounded queue, a
+tenth of the pads touched by sliding contacts, one subscriber to all hands. Its nodes are simulated ones until
+they are booted; then each SYNC is answered with messages made before, while it is sent: their share of a core
+is *generator*. *Core* is the hot thread's: SYNC, receive, tick, send and all other stages. *Sustained*: at
+most 0.1 % of the samples late, and of the periods skipped, without a SYNC. *Memory*: samples of 15 pads at 1
+kHz go through pipeline and publisher as fast as they can, contacts begin and end, and their stamps are the
+clock; growth from a third on (least squares). Exit status 1 if a sample was lost or the memory grows.
 """
 
 from __future__ import annotations
 
-import argparse
-import gc
-import json
 import multiprocessing
 import os
 import queue
@@ -33,9 +27,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from benchmarks.bench_latency import PATHS, descriptors, film, machine, resident_mb
-from benchmarks.page import made_by, options, output_folder
-from benchmarks.socket_nodes import SocketNodes
+from benchmarks.page import Report, options
+from benchmarks.served_hand import PATHS, descriptors, film, resident_mb
 from handtouch import wire
 from handtouch.config import (
     Bus,
@@ -51,7 +44,7 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.device import DeviceBus
 from handtouch.wire import PadState
 
-PADS_PER_BUS, PADS_PER_SOCKET = 8, 60
+PADS_PER_BUS = 8
 AIM = 0.60
 LIMITS: tuple[tuple[int, int], ...] = (
     (30, 500),
@@ -64,7 +57,6 @@ LIMITS: tuple[tuple[int, int], ...] = (
     (240, 500),
 )
 """Pads and SYNC rates [Hz] tried, by their product, to find the overrun of the loop"""
-SOCKET_LIMITS = ((60, 1000), (120, 1000), (240, 500), (240, 1000), (480, 500), (480, 1000))
 LIMIT_S = 8.0
 MISSED = 1e-3
 """Fraction of late samples or skipped periods above which a run counts as overrun"""
@@ -79,22 +71,22 @@ GIL_SWITCH_S = 0.0005
 REPORT_PERIOD_S = 15.0
 
 
-def hands_of(
-    pads: int, rate_hz: float, folder: Path, interface: str = "virtual", per_bus: int = PADS_PER_BUS
-) -> Deployment:
-    """Return a deployment of shipped hands with `per_bus` pads per bus."""
+def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:
+    """Return a deployment of shipped hands with `PADS_PER_BUS` pads per bus."""
     shipped_hand = load(shipped.path("utah_mit.toml"))
     (hand,) = shipped_hand.hands
     hands = []
     for first in range(0, pads, len(hand.pads)):
         some = tuple(
-            pad.model_copy(update={"bus": f"b{n // per_bus}", "node_id": 1 + n % per_bus, "serial": 1000 + n})
+            pad.model_copy(
+                update={"bus": f"b{n // PADS_PER_BUS}", "node_id": 1 + n % PADS_PER_BUS, "serial": 1000 + n}
+            )
             for n, pad in enumerate(hand.pads[: pads - first], first)
         )
         hands.append(hand.model_copy(update={"name": f"h{first}", "pads": some}))
     buses = tuple(
-        Bus(name=f"b{n}", interface=interface, channel=f"{folder.name}.{n}")
-        for n in range(-(-pads // per_bus))
+        Bus(name=f"b{n}", interface="virtual", channel=f"{folder.name}.{n}")
+        for n in range(-(-pads // PADS_PER_BUS))
     )
     endpoints = {name: f"ipc://{folder}/{name}" for name in ("live", "complete", "control", "inputs")}
     own = {**endpoints, "store": str(folder / "calibrations.db")}
@@ -209,16 +201,11 @@ def touches(pads: int, part: float) -> NDArray[np.int64]:
     return counts
 
 
-def served(pads: int, rate_hz: int, seconds: float, socket: bool = False) -> dict[str, Any]:
-    """Run the daemon at this rate for a time, with its nodes in process or beyond sockets."""
+def served(pads: int, rate_hz: int, seconds: float) -> dict[str, Any]:
+    """Run the daemon at this rate for a time, with its nodes in process."""
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, ExitStack() as opened:
-        nodes: Nodes | SocketNodes
-        if socket:
-            deployment = hands_of(pads, rate_hz, Path(folder), "socketcan", PADS_PER_SOCKET)
-            nodes = SocketNodes(deployment, touches(pads, 0.1))
-        else:
-            deployment = hands_of(pads, rate_hz, Path(folder))
-            nodes = Nodes(deployment, touches(pads, 0.1))
+        deployment = hands_of(pads, rate_hz, Path(folder))
+        nodes = Nodes(deployment, touches(pads, 0.1))
         opened.callback(nodes.stop)
         daemon = opened.enter_context(HandtouchDaemon.open(deployment))
         period_ns = daemon.sync.period_ns
@@ -259,7 +246,7 @@ def wait_until_up(daemon: HandtouchDaemon) -> None:
 
 def watch(
     daemon: HandtouchDaemon,
-    nodes: Nodes | SocketNodes,
+    nodes: Nodes,
     thread: threading.Thread,
     pads: int,
     rate_hz: int,
@@ -279,36 +266,25 @@ def watch(
 
     before, busy_s, start_s = totals(), time.clock_gettime(clock), time.monotonic()
     feeding_s = nodes.busy_s()
-    longest, reported_s = 0, start_s
-    while (now_s := time.monotonic()) - start_s < seconds:
+    longest = 0
+    while time.monotonic() - start_s < seconds:
         longest = max(longest, nodes.waiting())
         time.sleep(0.05)
-        if now_s - reported_s > REPORT_PERIOD_S:
-            reported_s = now_s
-            _, ticks, overruns, missed, *_ = (totals() - before).tolist()
-            print(
-                f"{seconds - now_s + start_s:4.0f} s to go: {ticks} ticks, {overruns} periods skipped, "
-                f"{missed} samples late",
-                flush=True,
-            )
     took_s, busy_s = time.monotonic() - start_s, time.clock_gettime(clock) - busy_s
     feeding_s = nodes.busy_s() - feeding_s
     answered, ticks, overruns, missed, taken, samples, overflow = (totals() - before).tolist()
     return {
         "pads": pads,
-        "rate_hz": rate_hz,
-        "seconds": round(took_s, 1),
-        "touched": round(0.1 * pads),
-        "syncs_answered": answered,
+        "SYNCs/s": rate_hz,
+        "s": took_s,
         "ticks": ticks,
-        "overruns": overruns,
-        "missed": missed,
         "samples": samples,
-        "samples_taken": taken,
         "lost": max(0, (answered - 2) * pads - samples) + overflow,
-        "longest_queue": longest,
-        "hot_core": (busy_s - feeding_s) / took_s,
-        "generator_core": feeding_s / took_s,
+        "late": missed,
+        "skipped": overruns,
+        "queue": longest,
+        "core, %": 100 * (busy_s - feeding_s) / took_s,
+        "generator, %": 100 * feeding_s / took_s,
         "sustained": missed <= MISSED * samples
         and overruns <= MISSED * rate_hz * took_s
         and taken >= (1 - 10 * MISSED) * samples,  # no node timed out
@@ -321,7 +297,7 @@ def remember(hours: float) -> dict[str, Any]:
     moving = film(deployment, PATHS["sliding"])
     untouched = np.rint(np.random.default_rng(2).standard_normal((len(moving), *moving.shape[1:])))
     script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
-    rows: list[tuple[float, float, int, int, int]] = []
+    rows: list[tuple[float, float, int]] = []
     with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
         topics, authenticator = wire.topics_of(deployment.links_by_hand), Authenticator(context)
         live, complete = (f"ipc://{folder}/{stream}" for stream in ("live", "complete"))
@@ -347,10 +323,7 @@ def remember(hours: float) -> dict[str, Any]:
                 reader.recv_multipart()
                 received += 1
             if step % max(1, steps // 60) == 0:
-                objects = sum(gc.get_count())
-                rows.append(
-                    (t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid()), objects, received)
-                )
+                rows.append((t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid())))
                 print(f"{step / steps:4.0%} of the hour: {rows[-1][1]:.1f} MB", flush=True)
         begun = pipeline.tick.contacts.begun_count
         episodes = dict(publisher.congestion_episodes)
@@ -365,130 +338,40 @@ def remember(hours: float) -> dict[str, Any]:
         "ticks": steps,
         "contacts": begun,
         "messages": received,
-        "congestion_episodes": episodes,
-        "mb_first": rows[1][1],
-        "mb_third": float(late[0, 1]),
-        "mb_last": rows[-1][1],
-        "mb_per_hour": slope,
+        "congestion episodes": sum(episodes.values()),
+        "MB at first": rows[1][1],
+        "after a third": float(late[0, 1]),
+        "at the end": rows[-1][1],
+        "MB an hour": slope,
         "descriptors": [rows[1][2], rows[-1][2]],
-        "collections": [generation["collections"] for generation in gc.get_stats()],
     }
-
-
-def write(new: dict[str, Any], out: Path) -> str:
-    """Return the page, with the stored results of other parts."""
-    path = out / "soak_rate.json"
-    results = (json.loads(path.read_text()) if path.exists() else {}) | new
-    text = ["# Sustained rates of one core, and memory", ""]
-    if long := results.get("long"):
-        text += [
-            "The real daemon in one process with its nodes, eight pads to an in-process bus with a",
-            "bounded queue, a tenth of the pads touched by sliding contacts, one subscriber to all",
-            "hands. The share of a core is the hot thread's: SYNC, receive, tick, send and all",
-            f"other stages, without the nodes that answer in the same thread; the aim is {AIM:.0%}.",
-            f"{long['machine']}; load average when it ended {long['load']:.1f}, with the daemon's own.",
-            "",
-            *table([long]),
-        ]
-    if long := results.get("long_socket"):
-        text += [
-            f"Over pairs of sockets that carry `struct can_frame`, {PADS_PER_SOCKET} pads each, with",
-            f"the nodes in a process of their own; load average when it ended {long['load']:.1f}:",
-            "",
-            *table([long]),
-        ]
-    for key, bus in (("limits", "in-process buses"), ("limits_socket", "pairs of sockets")):
-        rows = results.get(key, [])
-        if not rows:
-            continue
-        text += [
-            f"Rate limits over {bus}, {LIMIT_S:.0f} s each; overrun is more than {MISSED:.1%} of the samples",
-            "late, or of the periods skipped, without a SYNC:",
-            "",
-            *table(rows),
-        ]
-        if sustained := [row for row in rows if row["sustained"]]:
-            best = max(sustained, key=lambda row: row["pads"] * row["rate_hz"])
-            product = best["pads"] * best["rate_hz"]
-            text += [
-                f"The largest product sustained is {best['pads']} pads at {best['rate_hz']} Hz,",
-                f"{product} samples/s: {product / 15:.0f} hands of 15 pads x Hz.",
-                "",
-            ]
-    if memory := results.get("memory"):
-        text += [
-            "## Memory",
-            "",
-            f"{memory['hours']:g} h of 15 pads at 1 kHz, compressed: {memory['ticks']} ticks through",
-            f"pipeline and publisher, {memory['contacts']} contacts begun, {memory['messages']} messages",
-            "received by a subscriber to everything,",
-            f"{sum(memory['congestion_episodes'].values())} congestion episodes. Resident",
-            f"{memory['mb_first']:.1f} MB at first, {memory['mb_third']:.1f} after a third,",
-            f"{memory['mb_last']:.1f} at the end: {memory['mb_per_hour']:+.2f} MB an hour from there on",
-            "(least squares). Descriptors",
-            f"{memory['descriptors'][0]} and {memory['descriptors'][1]}.",
-            "",
-        ]
-    text.append(f"{made_by()}.")
-    (out / "soak_rate.md").write_text("\n".join(text) + "\n")
-    path.write_text(json.dumps(results, indent=1) + "\n")
-    return "\n".join(text)
-
-
-def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Return table rows of daemon runs."""
-    return [
-        "| pads | SYNCs/s | s | ticks | samples | lost | late | skipped | queue | core | generator | |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
-        *(
-            "| {pads} | {rate_hz} | {seconds} | {ticks} | {samples} | {lost} | {missed} | {overruns} "
-            "| {longest_queue} | {hot_core:.0%} | {generator_core:.0%} |".format(**row)
-            + (" |" if row["sustained"] else " overrun |")
-            for row in rows
-        ),
-        "",
-    ]
 
 
 def main() -> int:
     parser = options(__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of 60 pads at 1 kHz; 0: not that")
+    parser.add_argument("--minutes", type=float, default=5.0, help="of 60 pads at 1 kHz")
     parser.add_argument("--hours", type=float, default=1.0, help="of the memory run, compressed; 0: not that")
-    parser.add_argument(
-        "--limits", action=argparse.BooleanOptionalAction, default=True, help="how far it goes"
-    )
-    parser.add_argument("--socket", action="store_true", help="over pairs of sockets; without the memory run")
     asked = parser.parse_args()
     sys.setswitchinterval(GIL_SWITCH_S)
-    limits, limit_s, out, failed = LIMITS, LIMIT_S, output_folder(asked.quick), False
-    kind = ""
-    if asked.socket:
-        limits, asked.hours, kind = SOCKET_LIMITS, 0.0, "_socket"
+    limits, limit_s = LIMITS, LIMIT_S
     if asked.quick:
         asked.minutes, asked.hours, limits, limit_s = 0.05, min(asked.hours, 0.01), ((30, 500),), 3.0
-    if asked.minutes:
-        long = served(60, 1000, 60 * asked.minutes, asked.socket) | {
-            "machine": machine(),
-            "load": os.getloadavg()[0],
-        }
-        print(long, flush=True)
-        failed |= long["lost"] > 0
-        write({f"long{kind}": long}, out)
-    if asked.limits:
-        rows = []
-        for pads, rate_hz in limits:
-            rows.append(served(pads, rate_hz, limit_s, asked.socket))
-            print(rows[-1], flush=True)
-        write({f"limits{kind}": rows}, out)
+    report = Report(asked.quick, "rates")
+    long = served(60, 1000, 60 * asked.minutes)
+    report.table("For a long time", [long])
+    report.table("How far it goes", [served(pads, rate_hz, limit_s) for pads, rate_hz in limits])
+    report.limit("samples lost", long["lost"], 0)
+    report.limit("of a core", long["core, %"], 100 * AIM, "%")
+    report.keep()
+    well = long["lost"] == 0
     if asked.hours:
-        memory = remember(asked.hours)
-        print(memory)
-        failed |= (
-            memory["mb_per_hour"] > GROWTH_MB_PER_H or memory["descriptors"][0] < memory["descriptors"][1]
-        )
-        write({"memory": memory}, out)
-    print(write({}, out))
-    return int(failed)
+        report, memory = Report(asked.quick, "memory"), remember(asked.hours)
+        report.table("Memory", [memory])
+        report.limit("growth", memory["MB an hour"], GROWTH_MB_PER_H, "MB an hour")
+        first, last = memory["descriptors"]
+        report.limit("descriptors more than at first", last - first, 0)
+        well &= report.keep()
+    return int(not well)
 
 
 if __name__ == "__main__":

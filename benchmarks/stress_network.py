@@ -1,81 +1,43 @@
-"""Stress networks, surfaces and strength: against 50-digit references and with arguments of every kind.
+"""Stress of networks, surfaces and strength: beside 50-digit references, in more regions than tests.
 
-Prints and writes to docs/benchmarks/stress_network.md, for each function and region, the worst error in units
-of eps times the condition of the problem (how far rounding of the arguments alone moves the answer) and where
-it was. Exit status 1 if any is worse than its limit. References are mpmath's and use other formulas: the
-network's is an Abelian integral on the half plane, 3 coefficients from its periods.
+For each function and region, the worst error in units of eps times the condition of the problem (how far
+rounding of the arguments alone moves the answer) and where it was. References are mpmath's and use other
+formulas: the network's is an Abelian integral on the half plane, 3 coefficients from its periods. Exit status
+1 if any is worse than its limit.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import platform
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mpmath as mp
 import numpy as np
 import numpy.typing as npt
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from benchmarks.page import made_by, options, output_folder
+from benchmarks.page import Report, options, progress
+from benchmarks.stress_field import EPS, Worst, report_worst
 from handtouch.field import (
-    AnisotropicSurface,
     ConeSurface,
     ContactLaw,
-    CylinderSurface,
-    Electrode,
     ElectrodeNetwork,
     ForceEstimateStatus,
-    PlaneSurface,
-    PrismSurface,
     Rectangle,
-    RevolutionSurface,
-    Sandwich,
     SphereSurface,
-    Surface,
     contact_stack_resistance,
 )
-from handtouch.field.network import SIDES
 
 FloatArray = npt.NDArray[np.float64]
-EPS = float(np.finfo(float).eps)
 ROOT = Path(__file__).parent.parent
 mp.mp.dps = 50
 
 
-class Row(NamedTuple):
-    function: str
-    region: str
-    cases: int
-    worst: float  # in eps x condition
-    limit: float
-    where: str
-
-
-class Worst:
-    """Keeps the worst of many errors."""
-
-    def __init__(self, function: str, region: str, limit: float) -> None:
-        self.row = Row(function, region, 0, 0.0, limit, "")
-
-    def add(self, error: float, condition: float, where: object) -> None:
-        ratio = abs(float(error)) / (EPS * float(condition))
-        ratio = math.inf if math.isnan(ratio) else ratio
-        worse = ratio >= self.row.worst
-        self.row = self.row._replace(
-            cases=self.row.cases + 1,
-            worst=max(ratio, self.row.worst),
-            where=str(where) if worse else self.row.where,
-        )
-
-
-def stack(share: float) -> Iterator[Row]:
+def stack(share: float) -> Iterator[Worst]:
     """Eq. 11 against Bessel functions of 30 digits."""
     rng = np.random.default_rng(1)
     for region, reach, scale in (
@@ -98,10 +60,10 @@ def stack(share: float) -> Iterator[Row]:
             found = float(contact_stack_resistance(sheet, layer, radius, outer))
             condition = 3 + 2 * float(s / (2 * mp.pi) / exact)
             worst.add(float(mp.mpf(found) / exact - 1), condition, (sheet, layer, radius, outer))
-        yield worst.row
+        yield worst
 
 
-def law(share: float) -> Iterator[Row]:
+def law(share: float) -> Iterator[Worst]:
     """Force from the current of a force: the inverse's own promise is 1e-8 of the force."""
     rng = np.random.default_rng(2)
     for hertz in (None, 1.0):
@@ -117,10 +79,10 @@ def law(share: float) -> Iterator[Row]:
                 continue
             step = float(curve.current(force * 1.0001, 5.0, 2400.0, outer)) / current - 1
             worst.add(float(found.force_n) / force - 1, 1 + 1e-4 / step, (layer, alpha, force, outer))
-        yield worst.row
+        yield worst
 
 
-def surfaces(share: float) -> Iterator[Row]:
+def surfaces(share: float) -> Iterator[Worst]:
     """Conformal coordinates of cones and spheres, and the way back."""
     rng = np.random.default_rng(3)
     cone, back = Worst("Cone.to_rectangle", "slopes of 1e-14 to 1", 40), Worst("Cone", "there and back", 60)
@@ -137,8 +99,8 @@ def surfaces(share: float) -> Iterator[Row]:
         x = float(pad.to_rectangle(u, 0.0)[0])
         cone.add(float(mp.mpf(x) / exact - 1) if u else 0.0, 4 + abs(slope) * slant, (slope, slant, u))
         back.add(float(pad.from_rectangle(x, 0.0)[0]) / u - 1, 4 + abs(slope) * slant, (slope, slant, u))
-    yield cone.row
-    yield back.row
+    yield cone
+    yield back
     ball = Worst("Sphere.to_rectangle", "to 1e-6 of the poles", 40)
     back = Worst("Sphere", "there and back", 60)
     for _ in range(round(share * 2000)):
@@ -154,8 +116,8 @@ def surfaces(share: float) -> Iterator[Row]:
         x = float(pad_.to_rectangle(u, 0.0)[0])
         ball.add(float(mp.mpf(x) / exact - 1), condition + abs(low) / u, (low, high, u))
         back.add(float(pad_.from_rectangle(x, 0.0)[0]) / u - 1, 4 + condition * steep, (low, high, u))
-    yield ball.row
-    yield back.row
+    yield ball
+    yield back
 
 
 class HalfPlane:
@@ -216,7 +178,7 @@ class HalfPlane:
         return [start[s] + sum(self.coefficients[s][p] * parts[p] for p in range(3)) for s in start]
 
 
-def networks(share: float) -> Iterator[Row]:
+def networks(share: float) -> Iterator[Worst]:
     """Fractions of gapped pads against Abelian integrals."""
     for region, aspect, gaps, margin in (
         ("square, gaps 0.2 to 20 %, 3 % inside", 1.0, (0.002, 0.01, 0.056, 0.2), 0.03),
@@ -242,17 +204,17 @@ def networks(share: float) -> Iterator[Row]:
                 )
                 condition = 1 + float(np.abs(slopes[:, 0]).max() * x + np.abs(slopes[:, 1]).max() * y)
                 worst.add(float(off), condition, (aspect, gap, x, y))
-        yield worst.row
+        yield worst
 
 
-def conductance(share: float) -> Iterator[Row]:
+def conductance(share: float) -> Iterator[Worst]:
     """Against the reference, which has ten decimals; symmetric, and rows that sum to zero, for any gaps."""
     given = Worst("ElectrodeNetwork.conductance", "reference, to its ten decimals", 1e-10 / EPS)
     for case in json.loads((ROOT / "tests" / "field" / "data" / "electrodes.json").read_text()):
         pad = ElectrodeNetwork(case["a"], case["b"], case["gap"], case["sheet_ohm_per_square"])
         off = np.abs(pad.conductance - case["conductance"]).max()
         given.add(off, 1.0, (case["a"], case["b"], case["gap"]))
-    yield given.row
+    yield given
     rng = np.random.default_rng(6)
     region = "50:1 to 1:50, gaps 1e-6 to 0.49 of the short side"
     mirrored = Worst("ElectrodeNetwork.conductance, asymmetry", region, 40)
@@ -263,11 +225,11 @@ def conductance(share: float) -> Iterator[Row]:
         largest = float(np.abs(found).max())
         mirrored.add(np.abs(found - found.T).max(), largest, (a, gap))
         sums.add(np.abs(found.sum(axis=1)).max(), largest, (a, gap))
-    yield mirrored.row
-    yield sums.row
+    yield mirrored
+    yield sums
 
 
-def ideal_limit(share: float) -> Iterator[Row]:
+def ideal_limit(share: float) -> Iterator[Worst]:
     """Without gaps: against `Rectangle`, which is proven to 50 digits, over aspects, edges and corners."""
     rng = np.random.default_rng(4)
     fractions = Worst("ElectrodeNetwork.fractions", "gap 0, 50:1 to 1:50, 1e-12 from corners", 40)
@@ -288,11 +250,11 @@ def ideal_limit(share: float) -> Iterator[Row]:
             ratio = pad.spreading_radius(x[inner], y[inner]) / ideal.conformal_radius(x[inner], y[inner]) - 1
             index = int(np.argmax(np.abs(ratio)))
             radius.add(ratio[index], 1, (a, x[inner][index], y[inner][index]))
-    yield fractions.row
-    yield radius.row
+    yield fractions
+    yield radius
 
 
-def round_trip(share: float) -> Iterator[Row]:
+def round_trip(share: float) -> Iterator[Worst]:
     """Location there and back, 3 % and farther from the edges, in shorter sides."""
     rng = np.random.default_rng(5)
     for region, longest, limit in (("to 2:1", 2.0, 1e3), ("to 5:1", 5.0, 1e5)):
@@ -308,7 +270,7 @@ def round_trip(share: float) -> Iterator[Row]:
             index = int(np.argmax(np.where(np.isnan(off), np.inf, off)))
             condition = _condition(pad, s[index] * a, t[index]) / short
             worst.add(off[index], condition, (a, series, s[index] * a, t[index]))
-        yield worst.row
+        yield worst
 
 
 def _condition(pad: ElectrodeNetwork, x: float, y: float) -> float:
@@ -319,239 +281,16 @@ def _condition(pad: ElectrodeNetwork, x: float, y: float) -> float:
     return float(np.hypot(x, y) + np.hypot(*moves))
 
 
-def arguments(_share: float) -> Iterator[Row]:
-    """Every public function on arrays of every kind: each element as if alone, no warning."""
-    pad = ElectrodeNetwork(1.3, 1.0, 0.05, 2400.0, (0.0, 336.0, 0.0, 100.0))
-    curve, sized = ContactLaw(2e-2, 1.5, 2e-3, 3e-4), ContactLaw(2e-2, 1.5, 2e-3, hertz_n=1.0)
-    shapes: list[Surface] = [
-        PlaneSurface(1.3, 1.0),
-        CylinderSurface(0.5, 1.3, 2.0),
-        ConeSurface(0.6, 0.4, 1.3, 2.0),
-        SphereSurface(1.0, -0.3, 1.0, 2.0),
-        RevolutionSurface((0.0, 0.5, 1.3), (0.5, 0.6, 0.4), 2.0),
-        PrismSurface(1.3, (0.0, 0.5, 1.0), (0.0, 0.2, 0.0)),
-        AnisotropicSurface(PlaneSurface(1.3, 1.0), 3.0),
-    ]
-    pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
-    pieces = [Electrode(side, start, stop) for side in SIDES for start, stop in ((0.02, 0.48), (0.52, 0.98))]
-    parted = ElectrodeNetwork.from_sides(1.0, 1.0, pieces, 2400.0)
-
-    def four(x: Any, y: Any) -> FloatArray:
-        return np.stack(np.broadcast_arrays(x, y, 0.2, 0.3))
-
-    functions: dict[str, Callable[[Any, Any], npt.ArrayLike]] = {
-        "network.estimate": lambda x, y: pad.estimate(four(x, y), 0.01).x,
-        "from_sides.currents": parted.currents,
-        "with_series.currents": pad.with_series_ohm((0.0, 0.0, 500.0, 1e-3)).currents,
-        "Sandwich.currents": lambda x, y: pair.currents(x, y, 12.0, 0.02),
-        "Sandwich.force": lambda x, y: pair.force(np.stack(np.broadcast_arrays(x, y)), 12.0, 0.02).force_n,
-        "network.currents": pad.currents,
-        "network.jacobian": lambda x, y: pad.fractions_with_jacobian(x, y)[1],
-        "network.spreading_radius": pad.spreading_radius,
-        "network.series_resistance": pad.series_resistance,
-        "network.locate": lambda x, y: pad.locate(np.stack(np.broadcast_arrays(x, y, 0.2, 0.3))).x,
-        "contact_stack_resistance": lambda x, y: contact_stack_resistance(2400.0, x, y, 1.0),
-        "ContactLaw.current": lambda x, y: curve.current(x, 5.0, 2400.0, y),
-        "ContactLaw.force": lambda x, y: curve.force(x, 5.0, 2400.0, y, current_std_a=1e-4).force_n,
-        "ContactLaw.force, Hertz": lambda x, y: sized.force(x, 5.0, 2400.0, y).std_n,
-    }
-    for shape in shapes:
-        name = type(shape).__name__
-        functions |= {
-            f"{name}.point": shape.point,
-            f"{name}.tangents": shape.tangents,
-            f"{name}.normal": shape.normal,
-            f"{name}.scales": shape.scales,
-            f"{name}.from_rectangle": _stacked(shape.from_rectangle),
-            f"{name}.to_rectangle": _stacked(shape.to_rectangle),
-        }
-    odd = [
-        0.0,
-        -0.0,
-        5e-324,
-        1e-300,
-        1e-160,
-        0.3,
-        0.7,
-        1.0,
-        -0.1,
-        1e160,
-        1e300,
-        math.inf,
-        -math.inf,
-        math.nan,
-    ]
-    x, y = (v.ravel() for v in np.meshgrid(odd, odd))
-    xs = np.linspace(0.1, 0.9, 12).astype(np.float32)[::3]
-    xs.setflags(write=False)
-    for name, function in functions.items():
-        worst = Worst(name, "zeros, denormals, 1e-300 to 1e300, inf, NaN, kinds of arrays", 0)
-        together = np.asarray(function(x, y), float)
-        for i in range(x.size):
-            alone = np.asarray(function(x[[i]], y[[i]]), float)[..., 0]
-            with np.errstate(under="ignore"):  # of the comparison itself
-                same = np.isclose(together[..., i], alone, rtol=1e-12, atol=1e-14, equal_nan=True)
-            worst.add(0.0 if same.all() else math.inf, 1, (name, x[i], y[i]))
-        plain = np.asarray(function(xs.astype(float), 0.5), float)
-        same32 = np.array_equal(np.asarray(function(xs, 0.5)), plain, equal_nan=True)
-        worst.add(0.0 if same32 else math.inf, 1, (name, "float32, strided, read-only"))
-        worst.add(float(np.asarray(function(np.empty((0, 2)), np.empty((0, 2)))).size), 1, (name, "empty"))
-        whole = np.asarray(function(1, np.array([[0], [1]])), float)
-        same_int = np.array_equal(whole, function(1.0, np.array([[0.0], [1.0]])), equal_nan=True)
-        worst.add(0.0 if same_int else math.inf, 1, (name, "integers"))
-        yield worst.row._replace(where=worst.row.where if worst.row.worst else "")
-
-
-def _stacked(
-    function: Callable[[Any, Any], tuple[FloatArray, FloatArray]],
-) -> Callable[[Any, Any], FloatArray]:
-    return lambda x, y: np.stack(function(x, y))
-
-
-anything = st.floats(width=64) | st.sampled_from([0.0, -0.0, math.inf, -math.inf, math.nan, 5e-324, 1e308])
-part = st.floats(0.03, 0.97)
-
-
-def searches(share: float) -> Iterator[Row]:
-    """Failures found by hypothesis; any floating-point warning counts as one."""
-    search = settings(max_examples=round(share * 400), deadline=None, derandomize=True, database=None)
-    for part in (_search_networks, _search_points, _search_surfaces, _search_law, _search_sandwich):
-        yield part(search)
-
-
-def _search_networks(search: settings) -> Row:
-    worst = Worst(
-        "ElectrodeNetwork, fractions, locate, estimate", "any gaps to 45 %, 1:3 to 3:1 (hypothesis)", 1e5
-    )
-
-    @search
-    @given(st.floats(1 / 3, 3), st.lists(st.floats(1e-3, 0.45), min_size=4, max_size=4), part, part)
-    def attempt(aspect: float, gaps: list[float], u: float, v: float) -> None:
-        short = min(aspect, 1.0)
-        pad = ElectrodeNetwork(aspect, 1.0, [gap * short for gap in gaps], 1.0)
-        x, y = u * pad.a, v * pad.b
-        shares = pad.fractions(x, y)
-        worst.add(float(shares.sum()) - 1, 1, (aspect, gaps, u, v))
-        found, likely = pad.locate(shares), pad.estimate(shares, 1e-6)
-        condition = _condition(pad, x, y)
-        if not np.isnan(found.x + found.y):
-            worst.add(math.hypot(found.x - x, found.y - y), condition, (aspect, gaps, u, v))
-        worst.add(
-            min(math.hypot(likely.x - x, likely.y - y), 1e-6), max(condition, 1e5), (aspect, gaps, u, v)
-        )
-
-    attempt()
-    return worst.row
-
-
-def _search_points(search: settings) -> Row:
-    worst = Worst(
-        "ElectrodeNetwork, spoilt neighbours", "any numbers for places and currents (hypothesis)", 0.5
-    )
-    pad = ElectrodeNetwork(1.5, 1.0, 0.05, 2400.0, (10.0, 0.0, 336.0, 0.0))
-    good = pad.fractions(0.4, 0.6)
-
-    @search
-    @given(anything, anything, st.lists(anything, min_size=4, max_size=4))
-    def attempt(x: float, y: float, readings: list[float]) -> None:
-        shares = pad.fractions(np.array([x, 0.4]), np.array([y, 0.6]))
-        worst.add(EPS * float(not np.allclose(shares[:, 1], good, rtol=1e-12)), 1, (x, y))
-        found = pad.locate(np.stack([readings, good], axis=1))
-        worst.add(EPS * float(not np.isclose(found.x[1], 0.4, rtol=1e-9)), 1, readings)
-
-    attempt()
-    return worst.row
-
-
-def _search_surfaces(search: settings) -> Row:
-    worst = Worst("Cylinder, Cone, Sphere, Anisotropic", "there and back, any shape (hypothesis)", 1e4)
-
-    @search
-    @given(st.floats(0.1, 10), st.floats(0.1, 10), st.floats(0.05, 6.2), part, part)
-    def attempt(near: float, far: float, arc: float, u: float, v: float) -> None:
-        made: list[Surface] = [
-            CylinderSurface(near, far, arc),
-            ConeSurface(near, far, abs(far - near) + near, arc),
-            SphereSurface(near, -0.1 * min(far, 10) * 0.9, 0.1 * near, arc),
-        ]
-        for surface in [*made, *(AnisotropicSurface(other, far) for other in made)]:
-            x, y = u * surface.a, v * surface.b
-            again = surface.to_rectangle(*surface.from_rectangle(x, y))
-            worst.add(float(again[0] - x) / surface.a, 1, (type(surface).__name__, near, far, arc, u, v))
-            worst.add(float(again[1] - y) / surface.b, 1, (type(surface).__name__, near, far, arc, u, v))
-            along, around = surface.tangents(x, y)
-            worst.add(float(along @ around), 1, (type(surface).__name__, near, far, arc, u, v))
-            worst.add(float(np.linalg.norm(surface.normal(x, y))) - 1, 1, (near, far, arc, u, v))
-
-    attempt()
-    return worst.row
-
-
-def _search_law(search: settings) -> Row:
-    worst = Worst("ContactLaw, force of current", "any force, layer, exponent, where valid (hypothesis)", 1e8)
-    powers = st.floats(-6, 3)
-
-    @search
-    @given(powers, powers, st.floats(0.3, 3), st.floats(1.5, 4), st.booleans())
-    def attempt(force: float, layer: float, alpha: float, spread: float, hertz: bool) -> None:
-        law = ContactLaw(10**layer, alpha, 1e-3, hertz_n=1.0 if hertz else None)
-        radius = float(law.radius(10**force)) * 10**spread
-        current = law.current(10**force, 5.0, 2400.0, radius)
-        found = law.force(current, 5.0, 2400.0, radius)
-        if found.status == ForceEstimateStatus.VALID:
-            worst.add(float(found.force_n) / 10**force - 1, 1, (force, layer, alpha, spread, hertz))
-
-    attempt()
-    return worst.row
-
-
-def _search_sandwich(search: settings) -> Row:
-    worst = Worst(
-        "Sandwich, force of its own currents", "any force and radius, where valid (hypothesis)", 1e11
-    )
-    pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
-
-    @search
-    @given(st.floats(-2, 1), st.floats(-3.5, -2.5))
-    def attempt(force: float, radius: float) -> None:
-        found = pair.force(pair.currents(10**force, 10**radius, 12.0, 0.02), 12.0, 0.02)
-        if found.status == ForceEstimateStatus.VALID:
-            worst.add(float(found.force_n) / 10**force - 1, 1, (force, radius))
-
-    attempt()
-    return worst.row
-
-
 def main() -> int:
     """Run all parts; 1 if one is beyond its limit."""
     quick = options(__doc__).parse_args().quick
+    rows: list[Worst] = []
     warnings.simplefilter("error")
-    np.seterr(all="raise")
-    heads = ("function", "region", "cases", "worst, eps x condition", "limit", "where")
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    print("\n".join(lines))
-    failed = 0
-    for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks, arguments, searches):
-        for row in part(0.02 if quick else 1.0):
-            failed += row.worst > row.limit
-            mark = " **!**" if row.worst > row.limit else ""
-            cells = (
-                row.function,
-                row.region,
-                row.cases,
-                f"{row.worst:.2g}{mark}",
-                f"{row.limit:.2g}",
-                row.where,
-            )
-            lines.append("| " + " | ".join(map(str, cells)) + " |")
-            print(lines[-1], flush=True)
-    machine = f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
-    made = f"{made_by()}; {machine}, mpmath {mp.__version__}."
-    print(made)
-    head = ["# Stress of networks, surfaces and strength", "", made, ""]
-    out = output_folder(quick) / "stress_network.md"
-    out.write_text("\n".join(head + lines) + "\n")
-    return 1 if failed else 0
+    with np.errstate(all="raise"):
+        for part in (stack, law, surfaces, conductance, ideal_limit, round_trip, networks):
+            rows += part(0.02 if quick else 1.0)
+            progress(part.__name__)
+    return report_worst(Report(quick, mpmath=mp.__version__), rows)
 
 
 if __name__ == "__main__":

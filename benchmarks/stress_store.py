@@ -1,14 +1,15 @@
-"""Kill a process that calibrates and stores, at random instants; the store must hold what it had committed.
+"""The calibration store: kills at random instants, journal modes of SQLite, writes and openings.
 
-Also measures what a write costs under the journal modes that SQLite has, and how long opening takes.
-Prints its tables and writes docs/benchmarks/store.md, store.json and store.png.
+A process opens the store, estimates gains by contacts and writes versions of three nodes without a pause, and
+is killed at a random instant of any of that. It reports what it begins and every commit on a pipe; the store
+must hold what it had committed. A kill doesn't lose what the kernel has; for power loss see
+[calibrations](../calibrations.md). *Journal modes*: 500 transactions each, a row of 2 kB. *The store*: a
+whole calibration a write; opening checks the digest of all rows.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import platform
 import signal
 import sqlite3
 import struct
@@ -19,11 +20,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.page import made_by, options, output_folder, table
+from benchmarks.page import Report, options, progress
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import matplotlib
 import numpy as np
 
 from handtouch.calibration.calibration import (
@@ -39,9 +39,6 @@ from handtouch.calibration.calibration import (
 from handtouch.calibration.gains import GainEstimator
 from handtouch.calibration.store import Store
 from handtouch.field import Rectangle
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 ROOT = Path(__file__).parent.parent
 KILLS = 500
@@ -137,27 +134,24 @@ def _start(path: Path) -> tuple[int, int]:
     return child, reading
 
 
-def kills(folder: Path, count: int) -> tuple[dict[str, Any], list[float]]:
+def kills(folder: Path, count: int) -> dict[str, Any]:
     """`count` times: kill, open, compare the versions with the reported ones."""
     path, killer = folder / "store.db", Killer()
     reported: dict[int, int] = dict.fromkeys(SERIALS, 0)
     counts = dict.fromkeys(("undone", "unreported", "lost", "wrong", "unopened"), 0)
-    openings = []
     for kill in range(count):
         if kill % 50 == 0:
-            print(f"kill {kill} of {count}", file=sys.stderr)
+            progress(f"kill {kill} of {count}")
         for serial, number in killer.kill(path):
             reported[serial] = max(reported[serial], number)
         journal = path.with_name("store.db-journal")
         counts["undone"] += journal.exists() and journal.stat().st_size > 0
-        begin = time.perf_counter()
         try:
             store = Store(path)
         except Exception as error:  # noqa: BLE001 what the benchmark counts
             print(error, file=sys.stderr)
             counts["unopened"] += 1
             continue
-        openings.append(1e3 * (time.perf_counter() - begin))
         with store:
             for serial in SERIALS:
                 versions = store.versions(serial)
@@ -170,7 +164,7 @@ def kills(folder: Path, count: int) -> tuple[dict[str, Any], list[float]]:
                     sheet = version.calibration.sheet
                     counts["wrong"] += sheet is None or sheet.data != mark(serial, version.number)
                 reported[serial] = len(versions)
-    row = {
+    return {
         "kills": count,
         **{f"while {phase}": count for phase, count in killer.phases.items()},
         "commits": sum(reported.values()),
@@ -180,18 +174,13 @@ def kills(folder: Path, count: int) -> tuple[dict[str, Any], list[float]]:
         "wrong contents": counts["wrong"],
         "not opened": counts["unopened"],
     }
-    return row, openings
 
 
 def modes(folder: Path) -> list[dict[str, Any]]:
     """A row of 2 kB a transaction, as bare SQLite writes it."""
     rows = []
-    for journal, synchronous in (
-        ("WAL", "NORMAL"),
-        ("WAL", "FULL"),
-        ("DELETE", "FULL"),
-        ("DELETE", "EXTRA"),
-    ):
+    for mode in ("WAL NORMAL", "WAL FULL", "DELETE FULL", "DELETE EXTRA"):
+        journal, synchronous = mode.split()
         connection = sqlite3.connect(folder / f"{journal}-{synchronous}.db", isolation_level=None)
         connection.execute(f"PRAGMA journal_mode = {journal}")
         connection.execute(f"PRAGMA synchronous = {synchronous}")
@@ -247,49 +236,18 @@ def _quantiles(took_ms: list[float]) -> dict[str, float]:
     }
 
 
-def draw(path: Path, openings: list[float]) -> None:
-    figure, axes = plt.subplots(figsize=(7, 3.5), layout="constrained")
-    axes.plot(openings, ".", ms=3)
-    axes.set(xlabel="kill", ylabel="opening and checking, ms", ylim=(0, None))
-    axes.set_title("Opening the store after each kill, while it grows")
-    figure.savefig(path, dpi=100)
-
-
-def main() -> None:
+def main() -> int:
     quick = options(__doc__).parse_args().quick
-    machine = (
-        f"{os.cpu_count()} x {platform.machine()}, {platform.system()} {platform.release()}, "
-        f"Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, "
-        f"load {os.getloadavg()[0]:.1f}"
-    )
+    report = Report(quick, sqlite=sqlite3.sqlite_version)
     with tempfile.TemporaryDirectory(dir=ROOT, prefix=".stress-") as name:  # on a disk: /tmp may be memory
-        folder = Path(name)
-        killed, openings = kills(folder, 5 if quick else KILLS)
-        tables = {
-            "Kill -9 while calibrating and storing": (
-                "A process opens the store, estimates gains by contacts and writes versions of three "
-                "nodes without a pause, and is killed at a random instant of any of that. It reports what it "
-                "begins and every commit on a pipe. A kill doesn't lose what the kernel has; for power loss "
-                "see `docs/calibrations.md`.",
-                [killed],
-            ),
-            "Journal modes of SQLite": ("500 transactions each, a row of 2 kB.", modes(folder)),
-            "The store": (
-                "A whole calibration a write; opening checks the digest of all rows.",
-                writes_and_openings(folder, 100 if quick else 3000),
-            ),
-        }
-    page = ["# The calibration store", "", f"{made_by()}; {machine}.", ""]
-    for title, (note, rows) in tables.items():
-        page += table(title, note, rows)
-    out = output_folder(quick)
-    draw(out / "store.png", openings)
-    (out / "store.md").write_text("\n".join([*page, "![opening](store.png)", ""]))
-    record = {"machine": machine, "tables": {title: rows for title, (_, rows) in tables.items()}}
-    (out / "store.json").write_text(json.dumps(record, indent=1) + "\n")
-    if killed["lost commits"] or killed["wrong contents"] or killed["not opened"]:
-        sys.exit("the store has lost something")
+        killed = kills(Path(name), 5 if quick else KILLS)
+        report.table("Kill -9 while calibrating and storing", [killed])
+        report.table("Journal modes of SQLite", modes(Path(name)))
+        report.table("The store", writes_and_openings(Path(name), 100 if quick else 3000))
+    for failure in ("lost commits", "wrong contents", "not opened"):
+        report.limit(failure, killed[failure], 0)
+    return int(not report.keep())
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -2,31 +2,28 @@
 
 Grasps in MuJoCo in the worlds `default`, `harsh` and `ideal`, and grips with tremor, chatter and slips on a
 hand whose joints rest. Prints how the alarms score in cross-validation over seeds, the share of slips found
-and false alarms per minute of grip, for several thresholds; and writes
-src/handtouch/percept/slip_trees.json. Quick: few runs, nothing is written. `--cache` keeps the samples.
+and false alarms per minute of grip, for several thresholds; and writes src/handtouch/percept/slip_trees.json.
+Quick: few runs, nothing is written.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import bench_percept_grasp as scored
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks import bench_percept_grasp as scored
 from benchmarks import bench_slip, grasp_run
-from benchmarks.daemon_settings import pipeline_of
-from benchmarks.inline_process import InlineProcess
+from benchmarks.bench_slip import PerceptCollector
+from benchmarks.daemon_settings import InlineProcess, pipeline_of
 from benchmarks.page import ROOT, progress
-from benchmarks.slip_runs import PerceptCollector
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
@@ -251,8 +248,8 @@ def resting_joints(joints: int, noise_deg: float, seed: int) -> Callable[[str, i
     return joints_at
 
 
-def collect(cache: Path | None, quick: bool) -> list[Samples]:
-    """Return the samples of all runs, from the cache where they are in it."""
+def collect(quick: bool) -> list[Samples]:
+    """Return the samples of all runs."""
     tasks: dict[str, Callable[[], Samples]] = {}
     for world, seeds in GRASPS.items():
         for seed in seeds[:1] if quick else seeds:
@@ -262,14 +259,8 @@ def collect(cache: Path | None, quick: bool) -> list[Samples]:
         tasks |= {f"grip_{settings[2]}_{name}": run for name, run in grips(*settings)}
     found = []
     for name, run in tasks.items():
-        path = cache / f"{name}.pkl" if cache else None
-        if path and path.exists():
-            found.append(pickle.loads(path.read_bytes()))
-            continue
         found.append(run())
         progress(name)
-        if path:
-            path.write_bytes(pickle.dumps(found[-1]))
     return found
 
 
@@ -411,9 +402,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--quick", action="store_true", help="few runs; writes nothing")
-    parser.add_argument("--cache", type=Path, help="folder to keep samples in")
     args = parser.parse_args()
-    runs = collect(args.cache, args.quick)
+    runs = collect(args.quick)
     if not args.quick:
         own: list[FloatArray] = [np.zeros(0)] * len(runs)
         for fold in range(FOLDS):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 import sys
 from pathlib import Path
 from typing import Any
 
 from docutils import nodes
+from sphinx.errors import ExtensionError
 
 from handtouch import __version__
 
@@ -17,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from key_figures import draw_all
 from notebook_page import render_notebook
 
-from benchmarks.page import outdated
+from benchmarks.stale import outdated, unmarked
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 MAX_NUMBER_CHARACTERS = 24
@@ -65,11 +67,23 @@ def _in_list(line: str) -> str:
     return f"  {line.strip()}" if line.startswith(" ") else f"* {line}"
 
 
-def mark_outdated(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG001
+def mark_outdated(app: Any, page: str, source: list[str]) -> None:
     """Add a note below the title of a page of measurements that is older than the code it measures."""
-    if page.startswith("benchmarks/") and page != "benchmarks/README" and (reason := outdated(source[0])):
+    results = Path(app.srcdir) / f"{page}.json"
+    if page.startswith("benchmarks/") and results.exists():
+        parts = outdated(json.loads(results.read_text()))
         title, rest = source[0].split("\n", 1)
-        source[0] = f"{title}\n\n:::{{note}}\nOlder than the code: {reason}\n:::\n{rest}"
+        if parts:
+            commits = ", ".join(sorted({f"`{commit}`" for commit in parts.values()}))
+            note = f"The code that it measures has changed since commit {commits}."
+            source[0] = f"{title}\n\n:::{{note}}\n{note}\n:::\n{rest}"
+
+
+def check_quotes(app: Any) -> None:
+    """Fail for a front page that quotes outdated results without their commit."""
+    for path in (Path(app.srcdir).parent / "README.md", Path(app.srcdir) / "key_figures.md"):
+        if missing := unmarked(path.read_text()):
+            raise ExtensionError(f"{path.name} quotes outdated results without their commit: {missing}")
 
 
 def insert_notebooks(app: Any, page: str, source: list[str]) -> None:  # noqa: ARG001
@@ -93,6 +107,7 @@ def mark_numbers(app: Any, doctree: nodes.document) -> None:  # noqa: ARG001
 def setup(app: Any) -> None:
     """Sphinx calls it."""
     app.connect("builder-inited", lambda app: draw_all(Path(app.srcdir) / "_figures"))
+    app.connect("builder-inited", check_quotes)
     app.connect("source-read", mark_outdated)
     app.connect("source-read", insert_notebooks)
     app.connect("doctree-read", mark_numbers)

@@ -6,11 +6,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import matplotlib
@@ -51,18 +51,31 @@ def draw_all(folder: Path) -> None:
             figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
-def load(name: str) -> Any:
-    """Return the recorded results of a benchmark."""
-    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+def table(name: str, title: str, part: str = "") -> list[dict[str, Any]]:
+    """Return the rows of a table of a benchmark's recorded results."""
+    results = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+    rows: list[dict[str, Any]] = results["parts"][part]["tables"][title]
+    return rows
+
+
+def number(cell: Any) -> float:
+    """Return the number of a cell, NaN without one; of a share, its percentage."""
+    if isinstance(cell, dict):
+        return 100 * float(cell["count"]) / cell["total"] if cell["total"] else math.nan
+    words = str(cell).rstrip("%").split()
+    try:
+        return float(words[0].rstrip("%"))
+    except (IndexError, ValueError):
+        return math.nan
 
 
 def draw_position(axes: Axes) -> None:
     """Rms error of valid positions by world."""
-    results = load("worlds")
-    states = {key.split(", ")[1] for key in results if key.startswith("ideal, ")}
+    rows = {row["case"]: number(row["rms error"]) for row in table("worlds", "Position")}
+    states = {case.split(", ")[1] for case in rows if case.startswith("ideal, ")}
     (learnt,) = states - {"as configured"}
     for shift, colour, state in ((-0.2, BLUE, "as configured"), (0.2, ORANGE, learnt)):
-        errors = [1e3 * results[f"{world}, {state}, position"]["rms_error"] for world in WORLDS]
+        errors = [rows[f"{world}, {state}"] for world in WORLDS]
         bars = axes.bar([n + shift for n in range(len(WORLDS))], errors, 0.38, color=colour, label=state)
         axes.bar_label(bars, fmt="%.2g", padding=2)
     axes.set(xticks=range(len(WORLDS)), xticklabels=WORLDS, ylabel="rms position error, mm")
@@ -72,11 +85,12 @@ def draw_position(axes: Axes) -> None:
 
 def draw_coverage(axes: Axes) -> None:
     """Share of true values within the stated 95 % regions by world."""
-    results = load("worlds")
-    for shift, colour, quantity in ((-0.2, BLUE, "position"), (0.2, ORANGE, "force")):
-        found = [results[f"{world}, as configured, {quantity}"]["coverage"]["0.95"] for world in WORLDS]
-        shares = [100 * share["count"] / share["total"] for share in found]
-        bars = axes.bar([n + shift for n in range(len(WORLDS))], shares, 0.38, color=colour, label=quantity)
+    for shift, colour, quantity in ((-0.2, BLUE, "Position"), (0.2, ORANGE, "Force")):
+        rows = {row["case"]: number(row["in 95 %"]) for row in table("worlds", quantity)}
+        shares = [rows[f"{world}, as configured"] for world in WORLDS]
+        bars = axes.bar(
+            [n + shift for n in range(len(WORLDS))], shares, 0.38, color=colour, label=quantity.lower()
+        )
         axes.bar_label(bars, fmt="%.0f", padding=2)
     axes.axhline(95, color=GREY, linewidth=1, linestyle="--")
     axes.set(xticks=range(len(WORLDS)), xticklabels=WORLDS, ylabel="within the stated 95 % region, %")
@@ -86,18 +100,20 @@ def draw_coverage(axes: Axes) -> None:
 
 def draw_latency(axes: Axes) -> None:
     """Latency from the last CAN frame to the subscriber, median and 99th percentile."""
-    turns: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    for turn in load("latency")["udp_multicast"]["turns"]:
-        if turn["contacts"] == "sliding":
-            turns[turn["who"]].append((1e-3 * turn["p50_us"], 1e-3 * turn["p99_us"]))
+    rows = {
+        row["case"]: (1e-3 * number(row["p50, us"]), 1e-3 * number(row["p99, us"]))
+        for row in table("latency", "Latency", "udp_multicast")
+        if row["contacts"] == "sliding"
+    }
     names = {
         "daemon": "handtouch",
         "floor": "bare loop",
         "daemon, realtime_priority = 40, busy_poll_us = 1000": "handtouch,\nreal-time",
         "floor with that priority": "bare loop,\nreal-time",
     }
+    names = {who: name for who, name in names.items() if who in rows}
     for shift, colour, label, column in ((-0.2, BLUE, "median", 0), (0.2, ORANGE, "99th percentile", 1)):
-        values = [median(turn[column] for turn in turns[who]) for who in names]
+        values = [rows[who][column] for who in names]
         bars = axes.bar([n + shift for n in range(len(names))], values, 0.38, color=colour, label=label)
         axes.bar_label(bars, fmt="%.2f", padding=2)
     axes.set(xticks=range(len(names)), xticklabels=names.values(), ylabel="last CAN frame to subscriber, ms")
@@ -107,12 +123,14 @@ def draw_latency(axes: Axes) -> None:
 
 def draw_tick(axes: Axes) -> None:
     """Time to compute all pads once, by touched pads."""
-    rows = [row for row in load("tick")["rows"] if row["state"] == "hot" and row["touched"] == row["pads"]]
+    rows = [row for row in table("tick", "Microseconds") if int(row["touched"]) == int(row["pads"])]
     for colour, contacts in ((BLUE, "static"), (ORANGE, "sliding")):
-        points = sorted((row["pads"], row["tick"]) for row in rows if row["contacts"] == contacts)
+        points = sorted(
+            (int(row["pads"]), number(row["tick"])) for row in rows if row["contacts"] == contacts
+        )
         axes.plot(*zip(*points, strict=True), "o-", color=colour, label=f"{contacts} contacts on all pads")
     axes.set(xscale="log", yscale="log", xlabel="pads", ylabel="one tick of all pads, us")
-    sizes = sorted({row["pads"] for row in rows})
+    sizes = sorted({int(row["pads"]) for row in rows})
     axes.set_xticks(sizes, [f"{size}" for size in sizes])
     axes.minorticks_off()
     axes.legend(frameon=False)
@@ -121,8 +139,8 @@ def draw_tick(axes: Axes) -> None:
 def draw_bus(axes: Axes) -> None:
     """Load of the CAN bus of 15 pads, by sampling."""
     loads: dict[str, list[float]] = defaultdict(list)
-    for row in load("idle")["loads"]:
-        loads[row["scene"]].append(100 * row["bus_load"])
+    for row in table("idle", "Load"):
+        loads[row["scene"]].append(number(row["bus load, %"]))
     axes.barh(list(loads), [max(values) for values in loads.values()], color=GREY, label="most")
     bars = axes.barh(
         list(loads), [min(values) for values in loads.values()], color=BLUE, label="all untouched"
@@ -142,15 +160,19 @@ def draw_methods(axes: Axes) -> None:
         "handtouch": (BLUE, "handtouch.field"),
         "core": (GREEN, "in the daemon"),
     }
-    rows = [row for row in load("methods")["rows"] if row["case"] == "ideal pad"]
+    rows = table("methods", "Ideal pad")
     for kind, (colour, label) in kinds.items():
-        points = [(row["us_per_contact"]["15"], row["rms_mm"]) for row in rows if row["kind"] == kind]
+        points = [
+            (number(row["us each, 15 in a call"]), number(row["rms, mm"]))
+            for row in rows
+            if row["kind"] == kind
+        ]
         axes.plot(*zip(*points, strict=True), "o", color=colour, label=label)
     axes.set(
         xscale="log", yscale="log", xlabel="us per contact, 15 at once", ylabel="rms error without noise, mm"
     )
     axes.axhline(
-        load("methods")["floors_mm"]["ideal pad"]["noise of the channels"], color=GREY, linestyle="--"
+        number(table("methods", "Floors, mm")[0]["noise of the channels"]), color=GREY, linestyle="--"
     )
     axes.text(0.99, 0.86, "noise of the channels", transform=axes.transAxes, ha="right", color=GREY)
     axes.legend(frameon=False, loc="lower right", fontsize=8)
@@ -158,21 +180,24 @@ def draw_methods(axes: Axes) -> None:
 
 def draw_slip(axes: Axes) -> None:
     """Detection latency of slips in the world `default` by speed, with the bound of a test that knows it."""
-    rows = [row for row in load("slip")["latency"] if (row["world"], row["hz"]) == ("default", 200.0)]
+    rows = [
+        {key: cell if key == "world" else number(cell) for key, cell in row.items()}
+        for row in table("slip", "From onset to alarm")
+    ]
+    rows = [row for row in rows if (row["world"], row["Hz"]) == ("default", 200.0)]
     for colour, force_n in ((BLUE, 0.5), (ORANGE, 2.0), (GREEN, 5.0)):
-        of_force = sorted((row["mm_per_s"], row) for row in rows if row["force_n"] == force_n)
-        found = [(speed, row["median_ms"]) for speed, row in of_force if row["median_ms"] is not None]
-        axes.plot(*zip(*found, strict=True), "o-", color=colour, label=f"{force_n:g} N")
-        bounds = [(speed, row["bound_ms"]) for speed, row in of_force if row["bound_ms"] is not None]
-        axes.plot(*zip(*bounds, strict=True), ":", color=colour)
+        of_force = [row for row in rows if row["N"] == force_n]
+        for column, line, label in (("median ms", "o-", f"{force_n:g} N"), ("bound ms", ":", None)):
+            points = sorted((row["mm/s"], row[column]) for row in of_force if math.isfinite(row[column]))
+            axes.plot(*zip(*points, strict=True), line, color=colour, label=label)
     axes.set(xscale="log", yscale="log", xlabel="speed, mm/s", ylabel="median detection latency, ms")
     axes.legend(frameon=False, title="dotted: knows the speed")
 
 
 def draw_diagnosis(axes: Axes) -> None:
     """Share of episodes with a fault that are diagnosed correctly."""
-    rows = [row for row in load("diagnose")["tables"]["World default"] if row["events"]]
-    recall = [float(row["recall, %"].split()[0]) for row in rows]
+    rows = [row for row in table("diagnose", "World default") if int(row["events"])]
+    recall = [number(row["recall, %"]) for row in rows]
     bars = axes.barh([row["played"] for row in rows], recall, color=BLUE)
     axes.bar_label(bars, fmt="%.0f", padding=3)
     axes.set(xlabel="episodes with the correct diagnosis, %", xlim=(0, 112))
@@ -181,12 +206,11 @@ def draw_diagnosis(axes: Axes) -> None:
 
 def draw_swap(axes: Axes) -> None:
     """Position error of a replaced node in the world `default` by contacts since."""
-    by_pad: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
-    for row in load("swap")["rows"]:
+    by_pad: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+    columns = ("contacts since", "position error, rms mm", "with the true gains, rms mm")
+    for row in table("swap", "Errors"):
         if row["world"] == "default":
-            by_pad[row["pad"]].append(
-                (row["contacts since"], row["position error, rms mm"], row["with the true gains, rms mm"])
-            )
+            by_pad[row["pad"]].append(tuple(number(row[column]) for column in columns))
     for colour, (pad, rows) in zip((BLUE, ORANGE, GREEN), by_pad.items(), strict=False):
         contacts, errors, known = zip(*sorted(rows), strict=True)
         axes.plot(contacts, errors, "o-", color=colour, label=f"pad {pad}")

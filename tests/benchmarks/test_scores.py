@@ -17,7 +17,6 @@ from scipy.stats import binom, binomtest, chi2, poisson
 from benchmarks import scores
 
 matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 FloatArray = NDArray[np.float64]
 
@@ -123,7 +122,7 @@ def test_no_valid_estimate_gives_no_figures_and_no_error() -> None:
     score = scores.EstimateScore.of_estimates(none)
     assert score.coverage[0.95] == scores.Share(0, 0)
     assert np.isnan([score.crps, score.ratio_rms, score.median_std]).all()
-    assert score.row()["in 95 %"] == "-"
+    assert str(score.row()["in 95 %"]) == "-"
 
 
 def test_slices_share_all_rows_among_themselves() -> None:
@@ -147,17 +146,6 @@ def test_bins_hold_their_lower_edge_and_sort_in_their_order() -> None:
     labels = scores.bin_labels([5.0, 0.1, 0.5, 2.0, 1.9], (0.5, 2.0, 5.0), "N")
     assert sorted(set(labels)) == ["1: below 0.5 N", "2: 0.5 to 2 N", "3: 2 to 5 N", "4: 5 and more N"]
     assert [int(label[0]) for label in labels] == [4, 1, 2, 3, 2]
-
-
-def test_the_calibration_curve_of_a_calibrated_forecaster_is_the_diagonal() -> None:
-    every = forecaster(2, 4000)
-    levels = np.linspace(0.1, 0.9, 9)
-    observed = [share.value for share in scores.calibration_curve(every, levels)]
-    assert observed == pytest.approx(levels.tolist(), abs=0.03)  # 3.8 standard deviations
-    figure, axes = plt.subplots()
-    scores.draw_calibration(axes, {"calibrated": every})
-    assert len(axes.lines) == 2
-    plt.close(figure)
 
 
 def test_the_oracle_of_a_linear_model_is_the_posterior_that_draws_have() -> None:
