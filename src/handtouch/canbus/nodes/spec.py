@@ -104,16 +104,16 @@ def sync_overflows(deployment: Deployment) -> dict[str, int]:
 def node_specs(deployment: Deployment) -> list[NodeSpec]:
     """Return the nodes of a deployment in the order of its pads. Raises EdsError."""
     pads, overflows = deployment.pads, sync_overflows(deployment)
-    owners = {pad.serial: f"{hand}/{pad.link} on {pad.bus}" for hand, pad in pads if pad.serial}
+    owners = {entry.pad.serial: f"{entry.name} on {entry.pad.bus}" for entry in pads if entry.pad.serial}
     specs = []
-    for slot, (hand, pad) in enumerate(pads):
-        kind = deployment.nodes[pad.node]
+    for slot, entry in enumerate(pads):
+        pad, kind = entry.pad, deployment.nodes[entry.pad.node]
         specs.append(
             NodeSpec(
                 slot=slot,
                 bus=pad.bus,
                 node_id=pad.node_id,
-                name=f"{hand}/{pad.link}",
+                name=entry.name,
                 eds=kind.eds,
                 vendor_id=kind.vendor_id,
                 product_code=kind.product_code,

@@ -92,7 +92,7 @@ def refit_recording(options: CalibrateOptions, file: Path, now: datetime) -> Cal
     result = job.fit_readings(readings, header.radius_std)
     if not options.yes or not options.store or result.report.fit.problems:
         return result
-    stored = store_law(options.config, job.deployment, (job.hand, job.pad), header, result.report, now)
+    stored = store_law(options.config, job.deployment, job.entry, header, result.report, now)
     line = f"stored as {stored}; a daemon that uses this store applies it within seconds"
     return CalibrationResult(result.report, (*result.lines, line), stored)
 
@@ -132,8 +132,8 @@ class _CalibrationJob:
     def __init__(self, options: CalibrateOptions) -> None:
         self.options = options
         self.deployment = config.load(options.config)
-        self.hand, self.pad = _find_pad(self.deployment, options.pad)
-        self.name = f"{self.hand}/{self.pad.link}"
+        self.entry = _find_pad(self.deployment, options.pad)
+        self.hand, self.pad, self.name = *self.entry, self.entry.name
         self.circuit_model = PadCircuitModel(self.deployment, self.pad)
         self.default_calibration_id = default_calibration_id_of(self.pad, self.deployment)
 
@@ -207,19 +207,17 @@ def _run_procedure(
         reason = "its node has no serial number to bind it to" if job.options.store else "--no-store"
         dialogue.print_line(f"Not stored ({reason}): applied until the daemon ends.", "bad")
     else:
-        pad = job.hand, job.pad
-        stored = store_law(job.options.config, job.deployment, pad, header(), result.report, clock())
+        stored = store_law(job.options.config, job.deployment, job.entry, header(), result.report, clock())
         dialogue.print_line(f"Stored as {stored}.", "good")
     applied = served.apply_law(stored or "guided", result.report.fit.law)
     dialogue.print_line(f"{job.name}: calibration {applied} is active.", "good")
     return CalibrationResult(result.report, result.lines, applied)
 
 
-def _find_pad(deployment: config.Deployment, name: str) -> tuple[str, config.Pad]:
+def _find_pad(deployment: config.Deployment, name: str) -> config.NamedPad:
     """Return the pad "right/thumb_distal", or "thumb_distal" if only one hand has it. Raises ValueError."""
-    pads = deployment.pads
-    found = [(hand, pad) for hand, pad in pads if name in (pad.link, f"{hand}/{pad.link}")]
+    found = [entry for entry in deployment.pads if name in (entry.pad.link, entry.name)]
     if len(found) != 1:
-        names = ", ".join(f"{hand}/{pad.link}" for hand, pad in pads)
+        names = ", ".join(deployment.pad_names)
         raise ValueError(f"PAD {name}: names {len(found)} pads, one is calibrated at a time; pads: {names}")
     return found[0]

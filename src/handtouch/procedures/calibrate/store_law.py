@@ -28,7 +28,7 @@ METHOD = "guided session"
 def store_law(
     path: Path,
     deployment: config.Deployment,
-    pad: tuple[str, config.Pad],
+    pad: config.NamedPad,
     header: RecordingHeader,
     report: CalibrationReport,
     now: datetime,
