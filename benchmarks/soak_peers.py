@@ -511,7 +511,9 @@ def _command_by_gateway(gateway: Path, folder: Path, ids: list[int], generator: 
         for name, (kind, value) in objects.items()
     ]
     dcf = folder / "gateway.dcf"
-    dcf.write_text("[DeviceInfo]\n" + "".join(sections) + "[DeviceComissioning]\nNodeID=127\n")
+    dcf.write_text(
+        "[DeviceInfo]\nBaudRate_1000=1\n" + "".join(sections) + "[DeviceComissioning]\nNodeID=127\n"
+    )
     names = ("start", "stop", "preop", "reset comm", "reset node")
     commands = [f"1 {generator.choice((0, *ids))} {generator.choice(names)}" for _ in range(3)]
     lines = ["1 init 0", *commands, f"1 {generator.choice(ids)} r 0x1018 4 u32", ""]
@@ -519,7 +521,7 @@ def _command_by_gateway(gateway: Path, folder: Path, ids: list[int], generator: 
         [str(gateway), "-i", "300", "vcan0", str(dcf)],
         input="\n".join(lines), text=True, capture_output=True, timeout=60, check=False,
     )  # fmt: skip
-    if done.returncode or "OK" not in done.stdout:
+    if done.returncode or "[1] OK" not in done.stdout:
         raise RuntimeError(f"{gateway} ended with status {done.returncode}: {done.stdout}{done.stderr}")
 
 
