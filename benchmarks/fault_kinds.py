@@ -163,9 +163,9 @@ def sampler(deployment: Deployment, seed: int) -> Any:
 
 
 SYNC_ID, NMT, SDO_ANSWER, HEARTBEAT = 0x080, 0x000, 0x580, 0x700
-BOOT_REQUESTS = (*range(1, 5), *range(7, 17))
-"""SDO requests of the boot of a shipped node; an abort of each is reported. The fifth and the sixth read the
-error register and history, which a node may refuse."""
+BOOT_REQUESTS = (1, 4, *range(7, 14), *range(15, 18))
+"""SDO requests of the boot of a shipped node; an abort of each is reported. The others read what a node may
+refuse: product code and revision, error register and history, inhibit time."""
 ABORT = 0x08000000
 OBJECTS = ((0x1018, 1), (0x1018, 4), (0x1A01, 0), (0x1A01, 2), (0x1801, 1), (0x1801, 2), (0x1017, 0))
 
