@@ -100,8 +100,9 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         options = vars(build_parser().parse_args(arguments))
         command: Callable[..., int] = options.pop("command")
-        if (kind := options.pop("endpoint_kind", None)) is not None:
-            config = options.pop("daemon_config", options.get("config"))
+        kind = options.pop("endpoint_kind", None)
+        if "daemon_config" in options:
+            config = options.pop("daemon_config")
             try:
                 options["endpoint"] = find_endpoint(kind, options["endpoint"], config)
             except (ValueError, OSError) as error:

@@ -123,7 +123,7 @@ def _add_direct(direct: argparse._ArgumentGroup) -> None:
 def run(
     pad: str,
     *,
-    endpoint: str,
+    endpoint: str | None,
     key: str | None,
     as_json: bool,
     live: str | None,
@@ -150,6 +150,12 @@ def run(
     if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
         print(f"handtouch calibrate: {conflict}", file=sys.stderr)
         return 2
+    try:
+        endpoint = find_endpoint("control", endpoint, config)
+        stream = find_endpoint("live", live, config)
+    except (ValueError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
     if from_file is not None and not from_file.is_file():
         print(f"{from_file}: no such file; --from reads readings that --log recorded", file=sys.stderr)
         return 2
@@ -157,7 +163,6 @@ def run(
         guided_options = calibrate.CalibrateOptions(
             pad=pad, config=config, weights=weights, from_file=from_file, as_json=as_json, **options
         )
-        stream = find_endpoint("live", live, config)
         return _run_guided(guided_options, calibrate.DaemonEndpoints(stream, endpoint, key))
     if law is not None:
         values["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), law, strict=True))

@@ -134,7 +134,8 @@ def add_bus(
 def add_endpoint(parser: argparse.ArgumentParser, kind: str, *, config: bool = True) -> None:
     """Add `--endpoint` and `--key`, and `--config` unless the command has it: which daemon to talk to.
 
-    `kind`: a key of ENDPOINTS. `main` replaces the endpoint by `find_endpoint` before the command runs.
+    `kind`: a key of ENDPOINTS. `main` replaces the endpoint by `find_endpoint` before the command runs; a
+    command with a deployment file of its own does so itself.
     """
     parser.set_defaults(endpoint_kind=kind)
     default, text = ENDPOINTS[kind]

@@ -12,7 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from handtouch.cli.errors import file_error_text
-from handtouch.cli.options import add_endpoint, add_json, add_output, add_percepts, positive_number
+from handtouch.cli.options import (
+    add_endpoint,
+    add_json,
+    add_output,
+    add_percepts,
+    find_endpoint,
+    positive_number,
+)
 from handtouch.cli.progress import ProgressLine
 from handtouch.config import ConfigError
 from handtouch.host.installation import extra_command
@@ -83,7 +90,8 @@ def run(*, as_json: bool, **options: Any) -> int:
     the key; 2 for wrong usage or file.
     """
     try:
-        capture = Capture.open(RecordOptions(**options))
+        endpoint = find_endpoint("complete", options.pop("endpoint", None), options.get("config"))
+        capture = Capture.open(RecordOptions(endpoint=endpoint, **options))
     except (ConfigError, ValueError, OSError) as error:
         print(file_error_text(error), file=sys.stderr)
         return 2
