@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
-# Constants without an origin beside them were chosen; docs/benchmarks/percept.md measures what they yield.
+# Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they
+# yield.
 SHAPE_CLASSES = ("flat", "edge", "cylinder", "sphere")
 SIZE_PARAMETERS = {"flat": (), "edge": (), "cylinder": ("radius",), "sphere": ("radius",)}
 

@@ -17,7 +17,7 @@ import numpy as np
 from handtouch.supervisor.diagnose.hypotheses import Scores
 from handtouch.supervisor.diagnose.model import FloatArray
 
-# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and alarms.md measure
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.
 _ITERATIONS = 8
 _NON_POINT_SHARE_RANGE = (0.1, 0.7)

@@ -33,8 +33,8 @@ from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.wire.faults import FaultKind
 
 # Constants without another origin were tuned by hand on episodes of benchmarks/diagnose_episodes.py with
-# seeds below 1100; none is a counted frequency. docs/benchmarks/diagnose.md and alarms.md measure what they
-# yield.
+# seeds below 1100; none is a counted frequency. docs/benchmarks/diagnose.md and soak_alarms.md measure what
+# they yield.
 SUSPICION_NATS = 20.0
 """Sum at which a fault is suspected. With an exact model, false suspicions would be e^20 = 5e8 contacts apart
 on average (Lorden 1971), 15 years of a contact a second."""

@@ -43,7 +43,7 @@ from handtouch.supervisor.diagnose.static_load import StaticLoadDetector
 from handtouch.wire.faults import FaultKind
 
 BoolArray = NDArray[np.bool_]
-# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and alarms.md measure
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.
 _MIN_CONFIDENCE_CHANGE = 0.3  # that is reported
 _MIN_CONTACT_COUNTS, _MAX_RELEASED_COUNTS = 250.0, 60.0

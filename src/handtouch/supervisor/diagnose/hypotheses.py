@@ -23,7 +23,7 @@ from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
 from handtouch.wire.faults import FaultKind
 
-# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and alarms.md measure
+# Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.
 _UNKNOWNS = 3
 MIN_CHANNELS = _UNKNOWNS + 1
