@@ -20,6 +20,8 @@ DEFAULT_TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
 class BridgeError(ValueError):
     """Options that can't be fulfilled; the text contains the remedy."""
 
+    exit_status = 2
+
 
 @dataclass(frozen=True)
 class BridgedDaemon:

@@ -27,10 +27,10 @@ _log = logging.getLogger("handtouch.bridge")
 _POLL_S = 0.2
 
 
-def run_bridge(options: BridgeOptions, stop: threading.Event) -> list[PermissionError]:
-    """Forward topics until `stop`; return the errors of daemons that rejected the key.
+def run_bridge(options: BridgeOptions, stop: threading.Event) -> None:
+    """Forward topics until `stop`.
 
-    Raises BridgeError, ConfigError.
+    Raises BridgeError, ConfigError, and PermissionError if daemons reject the key.
     """
     with ExitStack() as opened:
         threads = [_RelayThread(relay, stop) for relay in _open_relays(options, opened)]
@@ -39,7 +39,8 @@ def run_bridge(options: BridgeOptions, stop: threading.Event) -> list[Permission
         stop.wait()
         for thread in threads:
             thread.join()
-    return [thread.error for thread in threads if thread.error is not None]
+    if errors := [str(thread.error) for thread in threads if thread.error is not None]:
+        raise PermissionError("\n".join(errors))
 
 
 def _open_relays(options: BridgeOptions, opened: ExitStack) -> Iterator[Relay]:

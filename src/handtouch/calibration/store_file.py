@@ -36,6 +36,8 @@ _DAMAGE_ERRORS = (None, sqlite3.SQLITE_ERROR, 522)
 class StoreError(Exception):
     """The store can't be used; the text has cause and remedy."""
 
+    exit_status = 2
+
 
 class DamagedStoreError(StoreError):
     """The content isn't what was written; the text has the new path of the file."""

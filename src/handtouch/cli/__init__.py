@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from handtouch import __version__
+from handtouch.cli.errors import failing
 from handtouch.cli.options import (
     EXIT_STATUS_HELP,
     CommandParser,
@@ -103,12 +104,14 @@ def _run(arguments: Sequence[str] | None) -> int:
         kind = options.pop("endpoint_kind", None)
         if "daemon_config" in options:
             config = options.pop("daemon_config")
-            try:
+            with failing(2, ValueError, OSError):
                 options["endpoint"] = find_endpoint(kind, options["endpoint"], config)
-            except (ValueError, OSError) as error:
-                print(error, file=sys.stderr)
-                return 2
         return command(**options)
+    except Exception as error:
+        if (status := getattr(error, "exit_status", None)) is None:
+            raise
+        print(error, file=sys.stderr)
+        return int(status)
     finally:  # --help and wrong usage end by SystemExit
         if sys.stdout is not None:
             sys.stdout.flush()  # while an error of it can be handled

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import contextlib
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from handtouch.cli.options import Subparsers, add_command, add_config
+from handtouch.cli.errors import failing
+from handtouch.cli.options import Subparsers, add_command, add_config, add_key
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +39,7 @@ def _add_ros2(bridges: Subparsers) -> None:
         metavar="TOPIC",
         help="topic of joint states to forward to the daemon; empty for none (default: /joint_states)",
     )
-    ros2.add_argument("--key", metavar="FILE", help="client key, for a daemon that requires one")
+    add_key(ros2)
 
 
 def _add_zenoh(bridges: Subparsers) -> None:
@@ -81,7 +82,7 @@ def _add_zenoh(bridges: Subparsers) -> None:
         action="store_true",
         help="also forward control requests, from any client on the Zenoh network",
     )
-    bridge.add_argument("--key", metavar="FILE", help="client key, for daemons that require one")
+    add_key(bridge)
     bridge.add_argument(
         "--zenoh", type=Path, metavar="FILE", help="Zenoh configuration file: TLS, access control"
     )
@@ -102,31 +103,14 @@ def run_ros2(**options: Any) -> int:
     """Run the ROS 2 bridge until SIGINT or SIGTERM; exit status as `run_zenoh`."""
     from handtouch.bridge.ros2.runner import RosOptions, run_ros_bridge
 
-    def relay(stop: threading.Event) -> list[PermissionError]:
-        try:
-            run_ros_bridge(RosOptions(**options), stop)
-        except PermissionError as error:
-            return [error]
-        return []
-
-    return _run(relay)
+    return _run(lambda stop: run_ros_bridge(RosOptions(**options), stop))
 
 
-def _run(relay: Callable[[threading.Event], list[PermissionError]]) -> int:
-    from handtouch.bridge.options import BridgeError
-    from handtouch.config import ConfigError
+def _run(relay: Callable[[threading.Event], None]) -> int:
     from handtouch.host import logs
     from handtouch.host.signals import stop_on_signals
 
     stop = stop_on_signals()
-    logging_session = logs.start_logging()
-    try:
-        errors = relay(stop)
-    except (BridgeError, ConfigError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    finally:
-        logging_session.close()
-    for rejection in errors:
-        print(rejection, file=sys.stderr)
-    return 1 if errors else 0
+    with contextlib.closing(logs.start_logging()), failing(1, PermissionError):
+        relay(stop)
+    return 0

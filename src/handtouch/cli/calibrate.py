@@ -12,9 +12,9 @@ from typing import Any
 
 from handtouch.calibration.store import StoreError
 from handtouch.cli import requests
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import find_endpoint, integer, positive_number
 from handtouch.cli.requests import add_request
-from handtouch.config import ConfigError
 from handtouch.host.json_output import print_json
 from handtouch.procedures import calibrate
 
@@ -145,20 +145,14 @@ def run(
     values: dict[str, Any] = {"gains": gains, "offset_counts": offsets, "law": law}
     values = {option: value for option, value in values.items() if value is not None}
     if hertz_force_n is not None and law is None:
-        print("handtouch calibrate: --hertz-force-n is of the law that --law sets", file=sys.stderr)
-        return 2
+        raise CommandError("handtouch calibrate: --hertz-force-n is of the law that --law sets", 2)
     if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
-        print(f"handtouch calibrate: {conflict}", file=sys.stderr)
-        return 2
-    try:
+        raise CommandError(f"handtouch calibrate: {conflict}", 2)
+    with failing(2, ValueError, OSError):
         endpoint = find_endpoint("control", endpoint, config)
         stream = find_endpoint("live", live, config)
-    except (ValueError, OSError) as error:
-        print(error, file=sys.stderr)
-        return 2
     if from_file is not None and not from_file.is_file():
-        print(f"{from_file}: no such file; --from reads readings that --log recorded", file=sys.stderr)
-        return 2
+        raise CommandError(f"{from_file}: no such file; --from reads readings that --log recorded", 2)
     if guided and config is not None:
         guided_options = calibrate.CalibrateOptions(
             pad=pad, config=config, weights=weights, from_file=from_file, as_json=as_json, **options
@@ -188,28 +182,18 @@ def _find_conflict(
 
 
 def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
-    try:
+    # RuntimeError: the daemon refuses
+    with failing(2, ValueError), failing(1, calibrate.CalibrationError, StoreError, OSError, RuntimeError):
         if options.from_file is not None:
             result = calibrate.refit_recording(options, options.from_file, datetime.now(UTC))
-            if options.as_json:
-                _print_json(result)
-            else:
+            failed = bool(result.report.fit.problems)
+            if not options.as_json:
                 print("\n".join(result.lines))
-            return 1 if result.report.fit.problems else 0
-        # with --json, standard output is for the result alone
-        with contextlib.redirect_stdout(sys.stderr) if options.as_json else contextlib.nullcontext():
-            result = calibrate.run_guided(options, endpoints, lambda: datetime.now(UTC))
-        if options.as_json:
-            _print_json(result)
-        return 0 if result.calibration_id else 1
-    except (calibrate.CalibrationError, StoreError, OSError, RuntimeError) as error:  # the daemon refuses
-        print(error, file=sys.stderr)
-        return 1
-    except (ConfigError, ValueError) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
-def _print_json(result: calibrate.CalibrationResult) -> None:
-    record = calibrate.report.to_json(result.report, calibration_id=result.calibration_id or None)
-    print_json(record)
+        else:
+            # with --json, standard output is for the result alone
+            with contextlib.redirect_stdout(sys.stderr) if options.as_json else contextlib.nullcontext():
+                result = calibrate.run_guided(options, endpoints, lambda: datetime.now(UTC))
+            failed = not result.calibration_id
+    if options.as_json:
+        print_json(calibrate.report.to_json(result.report, calibration_id=result.calibration_id or None))
+    return 1 if failed else 0

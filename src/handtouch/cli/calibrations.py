@@ -255,16 +255,12 @@ def run_import(
 def _run_with_store(
     store: Path | None, deployment: Path | None, action: Callable[[Store], int], create: bool = False
 ) -> int:
-    try:
-        if store is None:
-            loaded = None if deployment is None else config.load(deployment)
-            beside = None if deployment is None else deployment.parent
-            store = store_path(None if loaded is None else loaded.daemon.store, beside)
-        with Store(store, create=create) as opened:
-            return action(opened)
-    except (StoreError, config.ConfigError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    if store is None:
+        loaded = None if deployment is None else config.load(deployment)
+        beside = None if deployment is None else deployment.parent
+        store = store_path(None if loaded is None else loaded.daemon.store, beside)
+    with Store(store, create=create) as opened:
+        return action(opened)
 
 
 def _print_version(version: CalibrationVersion) -> None:

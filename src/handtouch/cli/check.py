@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from handtouch import config
+from handtouch.cli.errors import CommandError
 from handtouch.cli.options import add_bus, add_config, add_json
 from handtouch.host.json_output import print_json
 from handtouch.procedures.check import find_warnings, load_deployment, summary
@@ -31,14 +31,17 @@ def run(config_path: Path | None, as_json: bool, schema: bool, buses: Sequence[s
         print_json(config.json_schema())
         return 0
     if config_path is None:
-        print("handtouch check: give a deployment file, or --schema", file=sys.stderr)
-        return 2
+        raise CommandError("handtouch check: give a deployment file, or --schema", 2)
     try:
-        deployment = load_deployment(config_path)
-        for text in buses:
-            deployment = config.with_bus(deployment, text)
+        deployment = load_deployment(config_path, buses)
     except config.ConfigError as error:
-        _print_error(error, as_json)
+        if not as_json:
+            raise
+        problems = [
+            {"location": one.location, "value": one.value.removeprefix(" = "), "remedy": one.remedy}
+            for one in error.problems
+        ]
+        print_json({"file": error.file, "ok": False, "problems": problems})
         return 2
     warnings = list(find_warnings(deployment))
     if as_json:
@@ -47,17 +50,6 @@ def run(config_path: Path | None, as_json: bool, schema: bool, buses: Sequence[s
     else:
         _print_summary(config_path, summary(deployment), warnings)
     return 1 if warnings else 0
-
-
-def _print_error(error: config.ConfigError, as_json: bool) -> None:
-    if not as_json:
-        print(error, file=sys.stderr)
-        return
-    problems = [
-        {"location": problem.location, "value": problem.value.removeprefix(" = "), "remedy": problem.remedy}
-        for problem in error.problems
-    ]
-    print_json({"file": error.file, "ok": False, "problems": problems})
 
 
 def _measured(pad: dict[str, Any]) -> str:

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from handtouch import config
-from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.nodes.spec import check_nodes
 from handtouch.cli.options import add_bus, add_config, add_json, positive_number
 from handtouch.cli.tables import make_table, table_lines
 from handtouch.host.json_output import print_json
-from handtouch.procedures.commission import daemon_is_running, select_rows
+from handtouch.procedures.commission import refuse_beside_daemon, select_rows
 from handtouch.procedures.commission.outcome import PadOutcome
 from handtouch.procedures.commission.procedure import CommissioningProcedure
 from handtouch.procedures.commission.record import CommissioningRecord
@@ -80,48 +79,32 @@ def run(
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # stop nodes, restore the terminal
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
-    try:
-        deployment = config.load(config_path)
-        for text in buses:
-            deployment = config.with_bus(deployment, text)
-        rows = select_rows(deployment, links)
-        if daemon_is_running(control := deployment.daemon.control):
-            print(
-                f"a daemon is running at {control} and uses these buses; stop it first (Ctrl-C, or "
-                "systemctl stop handtouch), and start it again afterwards",
-                file=sys.stderr,
-            )
-            return 1
-        deployment = check_nodes(deployment, str(config_path))
-    except config.ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    deployment = config.load(config_path, buses)
+    rows = select_rows(deployment, links)
+    refuse_beside_daemon(deployment.daemon.control)
+    deployment = check_nodes(deployment, str(config_path))
     record = CommissioningRecord(config_path, dry_run)
     saved, interrupted = True, False
-    try:
-        with ExitStack() as stack:
-            if as_json:  # standard output is for the result alone
-                stack.enter_context(redirect_stdout(sys.stderr))
-            source = stack.enter_context(open_sample_source(deployment))
-            dialogue = stack.enter_context(open_dialogue())
-            procedure = CommissioningProcedure(
-                deployment, source, dialogue, record.save, rows, assume_yes=assume_yes, timeout_s=timeout_s
-            )
-            if done := record.restore_progress(procedure, rows if links else ()):
-                dialogue.print_line(f"{done} pads were done before; --link NAME repeats one.")
-            try:
-                procedure.run()
-            except KeyboardInterrupt:
-                dialogue.print_line("Interrupted; results so far are kept.")
-                interrupted = True
-            except (OSError, ValueError, KeyError) as error:  # disk full; file edited meanwhile
-                dialogue.print_line(f"{config_path} can't be written: {error}", "bad")
-                saved = False
-            text = "" if as_json else format_table(procedure) + _format_changes(record)
-            result = _as_json(procedure, record) if as_json else None
-    except BusError as error:
-        print(error, file=sys.stderr)
-        return 1
+    with ExitStack() as stack:
+        if as_json:  # standard output is for the result alone
+            stack.enter_context(redirect_stdout(sys.stderr))
+        source = stack.enter_context(open_sample_source(deployment))
+        dialogue = stack.enter_context(open_dialogue())
+        procedure = CommissioningProcedure(
+            deployment, source, dialogue, record.save, rows, assume_yes=assume_yes, timeout_s=timeout_s
+        )
+        if done := record.restore_progress(procedure, rows if links else ()):
+            dialogue.print_line(f"{done} pads were done before; --link NAME repeats one.")
+        try:
+            procedure.run()
+        except KeyboardInterrupt:
+            dialogue.print_line("Interrupted; results so far are kept.")
+            interrupted = True
+        except (OSError, ValueError, KeyError) as error:  # disk full; file edited meanwhile
+            dialogue.print_line(f"{config_path} can't be written: {error}", "bad")
+            saved = False
+        text = "" if as_json else format_table(procedure) + _format_changes(record)
+        result = _as_json(procedure, record) if as_json else None
     if as_json:
         print_json(result)
     else:

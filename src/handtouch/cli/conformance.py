@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.text import Text
 
 from handtouch import __version__, config
-from handtouch.canbus.bus.port import BusError, Port
+from handtouch.canbus.bus.port import Port
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_bus, add_json, positive_number
 from handtouch.core.slab import Slab
 from handtouch.host.json_output import to_json
-from handtouch.procedures.commission import daemon_is_running
+from handtouch.procedures.commission import refuse_beside_daemon
 from handtouch.procedures.conformance import (
-    BusInUseError,
     ConformanceOptions,
     NodeReport,
     PortLine,
@@ -113,14 +113,9 @@ def run(
 ) -> int:
     """Test nodes and print the results; exit status 0, 1 (a check failed, no node, bus in use), 2 (usage)."""
     if bool(names) == all_nodes:
-        print("handtouch conformance: give node ids or pads, or --all", file=sys.stderr)
-        return 2
-    try:
-        deployment = None if config_path is None else config.load(config_path)
-        targets = select_targets(deployment, buses, names, None if eds is None else str(eds))
-    except config.ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+        raise CommandError("handtouch conformance: give node ids or pads, or --all", 2)
+    deployment = None if config_path is None else config.load(config_path)
+    targets = select_targets(deployment, buses, names, None if eds is None else str(eds))
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the node is set back
     daemon = (deployment.daemon if deployment else None) or config.Daemon()
     options = ConformanceOptions(
@@ -129,32 +124,20 @@ def run(
         resets=not no_reset,
         lss=not no_lss,
     )
-    if deployment is not None and daemon_is_running(daemon.control):
-        print(
-            f"a daemon is running at {daemon.control} and uses these buses; stop it first (Ctrl-C, or "
-            "systemctl stop handtouch), and start it again afterwards",
-            file=sys.stderr,
-        )
-        return 1
+    if deployment is not None:
+        refuse_beside_daemon(daemon.control)
     try:
         reports = _test_all(targets, options, interactive)
-    except (BusError, BusInUseError) as error:
-        print(error, file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         print("interrupted; the node was set back", file=sys.stderr)
         raise
     if not reports:
-        print("no node responds; check power, bit rate and termination", file=sys.stderr)
-        return 1
+        raise CommandError("no node responds; check power, bit rate and termination", 1)
     print(reports_json(reports) if as_json else to_text(reports, terminal=sys.stdout.isatty()), end="")
     if report_path is not None:
         text = reports_json(reports) if report_path.suffix == ".json" else to_text(reports, terminal=False)
-        try:
+        with failing(1, OSError):
             report_path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            print(f"{report_path}: {error.strerror}", file=sys.stderr)
-            return 1
     return 0 if all(report.ok for report in reports) else 1
 
 

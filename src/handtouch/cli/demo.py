@@ -23,6 +23,7 @@ from typing import Literal, Self
 
 from handtouch import wire
 from handtouch.cli.demo_rate import lower_rate
+from handtouch.cli.errors import failing
 from handtouch.cli.options import positive_number
 from handtouch.cli.simulate import add_grasp, add_scenario, add_world
 from handtouch.client import Subscriber, connect
@@ -108,7 +109,7 @@ def run(
     """
     logging.basicConfig(level=logging.ERROR)
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
-    try:
+    with failing(2, ValueError):  # an error in a file, or an impossible grasp
         deployment = _with_palm_output(
             _with_default_endpoints(
                 in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
@@ -121,34 +122,28 @@ def run(
         deployment = lower_rate(deployment, model)
         file = scenario_path or (None if config_path else shipped.path(DEFAULT_SCENARIO))
         scenario = _scenario(deployment, file, grasp=grasp, world=hidden, repeat=view)
-    except ValueError as error:  # an error in a file, or an impossible grasp
-        print(error, file=sys.stderr)
-        return 2
     endless = view and seconds is None
     length_s = float("inf") if endless else seconds or scenario.duration_s + _BOOT_ALLOWANCE_S
     stop = stop_on_signals()
     sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
     print("building the simulated hand ...", file=sys.stderr)
-    try:
+    with failing(2, ValueError):  # a scenario for another hand, an EDS that can't be simulated
         hand = SimulatedHand.open(deployment, scenario, hidden, record=not endless)
-        with (
-            hand,
-            TemporaryDirectory(prefix="handtouch-demo-") as folder,
-            HandtouchDaemon.open(deployment, model, folder=Path(folder)) as daemon,
-            _subscribe(daemon) as messages,
-            _browser_view(daemon) if view else nullcontext("") as url,
-        ):
-            collector = _ContactCollector(_choose_display(plain, url), keep=not endless)
-            print(_endpoints_text(daemon.publisher.endpoints["live"]), file=sys.stderr)
-            hand.publish_joints(deployment, scenario, daemon.inputs.endpoint)
-            hand.start()
-            with _daemon_thread(daemon, stop):
-                end_s = time.monotonic() + length_s
-                with collector:
-                    show_messages(messages, collector, lambda: stop.is_set() or time.monotonic() > end_s)
-    except ValueError as error:  # a scenario for another hand, an EDS that can't be simulated
-        print(error, file=sys.stderr)
-        return 2
+    with (
+        hand,
+        TemporaryDirectory(prefix="handtouch-demo-") as folder,
+        HandtouchDaemon.open(deployment, model, folder=Path(folder)) as daemon,
+        _subscribe(daemon) as messages,
+        _browser_view(daemon) if view else nullcontext("") as url,
+    ):
+        collector = _ContactCollector(_choose_display(plain, url), keep=not endless)
+        print(_endpoints_text(daemon.publisher.endpoints["live"]), file=sys.stderr)
+        hand.publish_joints(deployment, scenario, daemon.inputs.endpoint)
+        hand.start()
+        with _daemon_thread(daemon, stop):
+            end_s = time.monotonic() + length_s
+            with collector:
+                show_messages(messages, collector, lambda: stop.is_set() or time.monotonic() > end_s)
     for text in collector.diagnoses.values():
         print(f"diagnosis: {text}")
     if not endless:

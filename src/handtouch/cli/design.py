@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import argparse
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from handtouch import config
-from handtouch.cli.figures import draw_with_progress
+from handtouch.cli.errors import failing, needing
 from handtouch.cli.options import add_config, add_json, add_output, integer, positive_number
 from handtouch.cli.progress import ProgressLine
 from handtouch.cli.tables import make_table, output_console
-from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 if TYPE_CHECKING:
     from handtouch.design import DesignResult, ElectrodeLayout, PadTask, Statistic
 
 _COLUMNS = ("electrode", "from, mm", "to, mm", "then bare", "series, ohm")
+_PREFIX = "handtouch design: "
 _CHECK_SEED = 0  # any seed: it draws the deployment's tolerances, on which the result doesn't depend
 
 
@@ -112,28 +113,28 @@ def run(
     from handtouch.design import GOALS, FabricationLimits, PadTask, optimise_layout
     from handtouch.simulate.worlds import WORLDS
 
-    try:
-        described = WORLDS[world].draw(_CHECK_SEED).describe(config.load(config_path))
+    described = WORLDS[world].draw(_CHECK_SEED).describe(config.load(config_path))
+    with _failing(), ProgressLine() as progress:
         task = PadTask.from_deployment(described, link, force_n, nominal=world == "ideal")
         limits = FabricationLimits(min_gap_mm, min_electrode_mm, max_series_ohm)
-        with ProgressLine() as progress:
-            result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
-            simulated = _simulated(task, result, world, progress) if check else None
-            files, no_tables = _write(config_path, task, result, world, out, progress)
-    except ImportError as error:
-        print(f"handtouch design: {error}; {extra_command('figures')}", file=sys.stderr)
-        return 2
-    except (config.ConfigError, ValueError) as error:
-        print(f"handtouch design: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"handtouch design: {error}", file=sys.stderr)
-        return 1
+        result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
+        simulated = _simulated(task, result, world, progress) if check else None
+        files, no_tables = _write(config_path, task, result, world, out, progress)
     if as_json:
         print_json(_as_json(task, result, simulated, files) | {"no_tables": no_tables})
     else:
         _print(task, result, world, simulated, files, no_tables)
     return 0
+
+
+@contextmanager
+def _failing() -> Iterator[None]:
+    with (
+        needing("figures", _PREFIX),
+        failing(2, ValueError, prefix=_PREFIX),
+        failing(1, OSError, prefix=_PREFIX),
+    ):
+        yield
 
 
 def _draw_pad(config_path: Path, link: str | None, out: Path, as_json: bool) -> int:
@@ -144,14 +145,10 @@ def _draw_pad(config_path: Path, link: str | None, out: Path, as_json: bool) -> 
     from handtouch.design.pad_drawings import draw_design
     from handtouch.hand.expected_error import FIRM_TOUCH_N, error_summary, pad_design
 
-    try:
-        pad = pad_design(config.load(config_path), link)
-    except (config.ConfigError, ValueError) as error:
-        print(f"handtouch design: {error}", file=sys.stderr)
-        return 2
-    paths: list[Path] = []
-    if status := draw_with_progress("design", lambda progress: paths.extend(draw_design(pad, out, progress))):
-        return status
+    deployment = config.load(config_path)
+    with _failing(), ProgressLine() as progress:
+        pad = pad_design(deployment, link)
+        paths = draw_design(pad, out, progress.update)
     errors = [(force_n, *error_summary(pad, force_n)) for force_n in (pad.light_touch_n, FIRM_TOUCH_N)]
     if as_json:
         rows = [{"force_n": force, "median_m": median, "worst_m": worst} for force, median, worst in errors]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from handtouch import config
@@ -21,14 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(config_path: Path | None, as_json: bool) -> int:
     """Print the results of all checks; exit status 0, 1 (a check failed), 2 (invalid file)."""
-    deployment = None
-    if config_path is not None:
-        try:
-            deployment = config.load(config_path)
-        except config.ConfigError as error:
-            print(error, file=sys.stderr)
-            return 2
-    checks = list(check_host(deployment))
+    checks = list(check_host(None if config_path is None else config.load(config_path)))
     if as_json:
         print_json(checks)
     else:

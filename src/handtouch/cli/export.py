@@ -6,10 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from handtouch.cli.errors import file_error_text
+from handtouch.cli.errors import failing, needing
 from handtouch.cli.options import add_json, add_output
 from handtouch.cli.progress import ProgressLine
-from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 
@@ -36,22 +35,12 @@ def run(path: Path, folder: Path, format_: str, as_json: bool = False) -> int:
     from handtouch.record.recording import Recording
 
     if format_ == "parquet":
-        try:
+        with needing("export", "--format parquet: "):
             import pyarrow  # noqa: F401
-        except ImportError as error:
-            print(f"--format parquet: {error}; {extra_command('export')}, or use csv", file=sys.stderr)
-            return 2
-    try:
+    with failing(2, OSError, ValueError):
         recording = Recording(path)
-    except (OSError, ValueError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 2
-    try:
-        with ProgressLine() as progress, recording.checked():
-            counts = export(recording, folder, format_, progress.update)
-    except (OSError, ValueError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 1
+    with failing(1, OSError, ValueError), ProgressLine() as progress, recording.checked():
+        counts = export(recording, folder, format_, progress.update)
     tables = {folder / f"{name}.{format_}": rows for name, rows in counts.items()}
     if as_json:
         print_json({"tables": [{"file": file, "rows": rows} for file, rows in tables.items()]})

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from handtouch import config
-from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.find.survey import NodeFacts
-from handtouch.cli.errors import file_error_text
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_bus
 from handtouch.cli.progress import ProgressLine
 from handtouch.procedures.scan import ScanRequest, buses_to_scan, channel_names, scan_buses
@@ -33,26 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(path: Path, *, from_scan: bool, buses: Sequence[str]) -> int:
     """Write the file; exit status 0, 1 (no bus or node, or it can't be written), 2 (wrong usage)."""
-    try:
-        found = _found(buses_to_scan(None, buses or [_DEFAULT_BUS]), from_scan)
-    except config.ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except BusError as error:
-        print(error, file=sys.stderr)
-        return 1
+    found = _found(buses_to_scan(None, buses or [_DEFAULT_BUS]), from_scan)
     if from_scan and not any(nodes for _, nodes in found):
-        print("no node with four channels answered; see `handtouch scan`", file=sys.stderr)
-        return 1
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(starting_deployment(found))
-    except FileExistsError:
-        print(f"{path} exists; give the name of a new file", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 1
+        raise CommandError("no node with four channels answered; see `handtouch scan`", 1)
+    if path.exists():
+        raise CommandError(f"{path} exists; give the name of a new file", 2)
+    with failing(1, OSError), path.open("x", encoding="utf-8") as file:
+        file.write(starting_deployment(found))
     pads = sum(len(nodes) for _, nodes in found)
     print(
         f"{path}: {pads} pad{'s' * (pads != 1)}; replace the values of lines marked CHECK, then\n"

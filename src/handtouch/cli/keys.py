@@ -7,6 +7,7 @@ import platform
 import sys
 from pathlib import Path
 
+from handtouch.cli.errors import CommandError
 from handtouch.cli.options import add_command, add_json, add_output
 from handtouch.client import keys
 from handtouch.host.json_output import print_json
@@ -54,10 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:
     """Create a daemon's keys, named after the host by default; exit status 0, or 2 (failed)."""
-    try:
-        made = keys.make_server_keys(folder, name or platform.node())
-    except keys.KeyFileError as error:
-        return _print_error(error)
+    made = keys.make_server_keys(folder, name or platform.node())
     if as_json:
         print_json({"folder": folder, "name": made.name, "public_key": made.public_key})
         return 0
@@ -72,10 +70,7 @@ def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:
 def run_client(folder: Path, name: str, rights: str, file: Path | None, as_json: bool = False) -> int:
     """Create a client's keys; exit status 0, or 2 (failed)."""
     file = file or Path(f"{name}.key")
-    try:
-        keys.add_client(folder, name, rights, file)
-    except keys.KeyFileError as error:
-        return _print_error(error)
+    keys.add_client(folder, name, rights, file)
     if as_json:
         print_json({"file": file, "name": name, "rights": rights})
         return 0
@@ -90,10 +85,8 @@ def run_client(folder: Path, name: str, rights: str, file: Path | None, as_json:
 def run_list(folder: Path, as_json: bool) -> int:
     """List the authorised clients; exit status 0, 1 (unusable entries), 2 (no such folder)."""
     if not (folder / keys.CLIENTS_FOLDER).is_dir():
-        return _print_error(
-            keys.KeyFileError(
-                f"{folder}: not a folder of keys; create one with `handtouch keys make {folder}`"
-            )
+        raise CommandError(
+            f"{folder}: not a folder of keys; create one with `handtouch keys make {folder}`", 2
         )
     clients, problems = keys.load_clients(folder)
     if as_json:
@@ -108,14 +101,6 @@ def run_list(folder: Path, as_json: bool) -> int:
 
 def run_revoke(folder: Path, name: str) -> int:
     """Revoke a client's authorisation; exit status 0, or 2 (failed)."""
-    try:
-        keys.revoke(folder, name)
-    except keys.KeyFileError as error:
-        return _print_error(error)
+    keys.revoke(folder, name)
     print(f"revoked {name}; a running daemon closes its connections within a second")
     return 0
-
-
-def _print_error(error: keys.KeyFileError) -> int:
-    print(error, file=sys.stderr)
-    return 2

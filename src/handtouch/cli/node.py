@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from handtouch import config
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_config, add_json, integer, positive_number
 from handtouch.cli.tables import make_table, output_console
 from handtouch.host import logs
@@ -19,6 +20,7 @@ from handtouch.node.adc_fault import AdcError
 from handtouch.node.noise import PadNoise, measure_noise, position_noise
 from handtouch.node.settings import NodeFile, json_schema, load
 
+_PREFIX = "handtouch node: "
 _NOISE_COLUMNS = ("channel", "mean, A", "1 sigma, A", "1 sigma, counts")
 
 
@@ -63,14 +65,9 @@ def run_command(config_path: Path | None, *, schema: bool, measure_noise: bool, 
         print_json(json_schema())
         return 0
     if config_path is None:
-        print("handtouch node: give the file of the node, or --schema", file=sys.stderr)
-        return 2
-    try:
-        file = load(config_path)
-        deployment = config.load(options["deployment"]) if options["deployment"] else None
-    except config.ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+        raise CommandError("handtouch node: give the file of the node, or --schema", 2)
+    file = load(config_path)
+    deployment = config.load(options["deployment"]) if options["deployment"] else None
     if measure_noise:
         return _print_noise(
             file, deployment, options["samples"], options["period_ms"] * 1e-3, options["as_json"]
@@ -80,27 +77,21 @@ def run_command(config_path: Path | None, *, schema: bool, measure_noise: bool, 
 
 def _run(file: NodeFile) -> int:
     stop = stop_on_signals()
-    log_handler = logs.start_logging(file.settings.log_level)
     logging.getLogger("canopen").setLevel(logging.CRITICAL)
-    try:
+    with (
+        closing(logs.start_logging(file.settings.log_level)),
+        failing(1, OSError, ValueError, prefix=_PREFIX),
+    ):
         service.run(file, stop)
-    except (OSError, ValueError) as error:  # BusError is an OSError
-        print(f"handtouch node: {error}", file=sys.stderr)
-        return 1
-    finally:
-        log_handler.close()
     return 0
 
 
 def _print_noise(
     file: NodeFile, deployment: config.Deployment | None, samples: int, period_s: float, as_json: bool
 ) -> int:
-    try:
+    with failing(1, AdcError, ValueError, prefix=_PREFIX):
         measured = measure_noise(file, samples, period_s)
         positions = [position_noise(noise, deployment) if deployment else [] for noise in measured]
-    except (AdcError, ValueError) as error:
-        print(f"handtouch node: {error}", file=sys.stderr)
-        return 1
     pairs = list(zip(measured, positions, strict=True))
     if as_json:
         print_json([_noise_map(noise, errors) for noise, errors in pairs])

@@ -6,10 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from handtouch.cli.errors import file_error_text
+from handtouch.cli.errors import failing, needing
 from handtouch.cli.options import add_json, add_output, positive_number
 from handtouch.cli.progress import ProgressLine
-from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 
 
@@ -45,23 +44,13 @@ def run(
     from handtouch.record.plot import draw, read_plot_data
     from handtouch.record.recording import Recording
 
-    try:
+    with needing("figures", "handtouch plot: "):
         import matplotlib  # noqa: F401
-    except ImportError as error:
-        print(f"handtouch plot: {error}; {extra_command('figures')}", file=sys.stderr)
-        return 2
-    try:
+    with failing(2, OSError, ValueError):
         recording = Recording(path)
-    except (OSError, ValueError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 2
-    try:
-        with ProgressLine() as progress, recording.checked():
-            progress.update(f"reading {path}")
-            files = draw(read_plot_data(recording, from_s, to_s), folder, progress.update)
-    except (OSError, ValueError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 1
+    with failing(1, OSError, ValueError), ProgressLine() as progress, recording.checked():
+        progress.update(f"reading {path}")
+        files = draw(read_plot_data(recording, from_s, to_s), folder, progress.update)
     if as_json:
         print_json({"files": files})
     else:

@@ -6,12 +6,11 @@ Public name: `run`.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from handtouch.cli.errors import file_error_text
+from handtouch.cli.errors import failing
 from handtouch.cli.options import (
     add_endpoint,
     add_json,
@@ -21,7 +20,6 @@ from handtouch.cli.options import (
     positive_number,
 )
 from handtouch.cli.progress import ProgressLine
-from handtouch.config import ConfigError
 from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
@@ -89,23 +87,16 @@ def run(*, as_json: bool, **options: Any) -> int:
     Exit status 0; 1 if no message was received, messages were lost, the disk is full or the daemon rejects
     the key; 2 for wrong usage or file.
     """
-    try:
+    with failing(2, ValueError, OSError):
         endpoint = find_endpoint("complete", options.pop("endpoint", None), options.get("config"))
         capture = Capture.open(RecordOptions(endpoint=endpoint, **options))
-    except (ConfigError, ValueError, OSError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 2
     stop = stop_on_signals()
     with ProgressLine() as line:
         line.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
         if not capture.has_foxglove:
             line.print_line(NO_FOXGLOVE_TEXT)
-        with capture:
-            try:
-                capture.run(stop, _RecordingProgress(capture, line).update)
-            except PermissionError as error:
-                line.print_line(str(error))
-                return 1
+        with failing(1, PermissionError), capture:
+            capture.run(stop, _RecordingProgress(capture, line).update)
         return _print_summary(capture, line, as_json)
 
 

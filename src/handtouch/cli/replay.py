@@ -17,9 +17,10 @@ from typing import Any
 import zmq
 
 from handtouch import wire
-from handtouch.cli.errors import file_error_text
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_config, add_json, positive_number
 from handtouch.cli.progress import ProgressLine
+from handtouch.cli.tables import make_table, table_lines
 from handtouch.client.keys import KeyFileError
 from handtouch.config import ConfigError, Daemon, Deployment, load
 from handtouch.config.checks import endpoint_problem
@@ -33,6 +34,11 @@ from handtouch.record.recording import Recording, is_recording
 from handtouch.record.replay_log import LogReplaySummary, replay_log
 from handtouch.record.replay_recording import first_config, replay_recording
 from handtouch.view.message_lines import contact_line
+
+_COMPARISON_COLUMNS = (
+    *("link", "contacts", "only recorded", "only replayed", "samples", "shift mm", "95 %", "force"),
+    "begin ms",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,39 +101,23 @@ def run(
     on_contact = print_json_line if as_json else _print_line
     if speed is None:
         speed = 1.0 if publish else 0.0
-    try:
+    with failing(2, OSError, ValueError):
         deployment = load(config_path) if config_path else None
         with path.open("rb"):  # a missing file is wrong usage
             pass
         recording = Recording(path) if is_recording(path) else None
         settings = _publish_settings(deployment, live, complete) if publish else None
-    except (OSError, ValueError) as error:  # ConfigError is a ValueError
-        print(file_error_text(error), file=sys.stderr)
-        return 2
-    try:
-        with ExitStack() as stack:
-            if recording is not None:
-                return _replay_recording(recording, deployment, on_contact, settings, speed, report, stack)
-            if deployment is None:
-                print(
-                    f"{path}: a CAN log needs a deployment file: handtouch replay LOG CONFIG", file=sys.stderr
-                )
-                return 2
-            if report:
-                print(
-                    "--report is for MCAP recordings; a CAN log has no contacts to compare", file=sys.stderr
-                )
-                return 2
-            publisher, pace = _open_publisher(deployment, settings, speed, stack)
-            with _progress_shown(pace) as shown:
-                summary = replay_log(path, deployment, on_contact, pace=shown, publisher=publisher)
-            return _print_log_summary(summary, path, config_path)
-    except (ConfigError, KeyFileError) as error:
-        print(error, file=sys.stderr)
-        return 2
-    except (OSError, ValueError) as error:
-        print(file_error_text(error), file=sys.stderr)
-        return 1
+    with failing(1, OSError, ValueError), failing(2, ConfigError, KeyFileError), ExitStack() as stack:
+        if recording is not None:
+            return _replay_recording(recording, deployment, on_contact, settings, speed, report, stack)
+        if deployment is None:
+            raise CommandError(f"{path}: a CAN log needs a deployment file: handtouch replay LOG CONFIG", 2)
+        if report:
+            raise CommandError("--report is for MCAP recordings; a CAN log has no contacts to compare", 2)
+        publisher, pace = _open_publisher(deployment, settings, speed, stack)
+        with _progress_shown(pace) as shown:
+            summary = replay_log(path, deployment, on_contact, pace=shown, publisher=publisher)
+        return _print_log_summary(summary, path, config_path)
 
 
 def _replay_recording(
@@ -303,26 +293,15 @@ def _report(recording: Recording, result: ReplayResult) -> dict[str, Any]:
 
 def comparison_table(links: Mapping[str, LinkComparison]) -> str:
     """Format the comparison of each link as lines."""
-    rows = [
-        (
-            "link", "contacts", "only recorded", "only replayed", "samples", "shift mm", "95 %", "force",
-            "begin ms",
-        )
-    ]  # fmt: skip
+    table = make_table(*_COMPARISON_COLUMNS)
     for name, link in links.items():
-        rows.append(
-            (
-                name,
-                f"{link.recorded} -> {link.replayed}",
-                str(link.only_recorded),
-                str(link.only_replayed),
-                str(link.samples),
-                f"{link.shift_mm['median']:.3f}" if link.shift_mm else "-",
-                f"{link.shift_mm['p95']:.3f}" if link.shift_mm else "-",
-                f"x {link.force_ratio['median']:.3f}" if link.force_ratio else "-",
-                f"{link.begin_delay_ms:+.1f}" if link.begin_delay_ms is not None else "-",
-            )
+        table.add_row(
+            name,
+            f"{link.recorded} -> {link.replayed}",
+            *map(str, (link.only_recorded, link.only_replayed, link.samples)),
+            f"{link.shift_mm['median']:.3f}" if link.shift_mm else "-",
+            f"{link.shift_mm['p95']:.3f}" if link.shift_mm else "-",
+            f"x {link.force_ratio['median']:.3f}" if link.force_ratio else "-",
+            f"{link.begin_delay_ms:+.1f}" if link.begin_delay_ms is not None else "-",
         )
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
+    return "\n".join(table_lines(table))

@@ -1,31 +1,29 @@
-"""Output of the commands that send a request to a running daemon: tare, scene, snapshot, enable, ...
+"""Commands that send one request to a running daemon: tare, scene, snapshot, enable, ...
 
-Each `run_...` sends one request and prints the answer. Exit status 0, 1 (no daemon answers, it refuses, or a
+Each `run_...` sends its request and prints the answer. Exit status 0, 1 (no daemon answers, it refuses, or a
 pad was refused), 2 (an invalid endpoint or key file).
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from handtouch import wire
+from handtouch.cli.errors import failing
 from handtouch.cli.options import (
     add_endpoint,
     add_json,
     comma_separated,
     positive_number,
 )
-from handtouch.cli.scene_text import scene_lines
 from handtouch.client import request
+from handtouch.client.control import LONG_TIMEOUT_S, SHORT_TIMEOUT_S, SLOW_COMMANDS
 from handtouch.host.json_output import print_json
 from handtouch.host.user import user_name
 
-_SHORT_TIMEOUT_S, _LONG_TIMEOUT_S = 3.0, 60.0
+_MAX_NAMES = 4
 Reply = Mapping[str, Any]
 
 
@@ -117,123 +115,75 @@ def add_request(parser: argparse.ArgumentParser, run: Callable[..., int], *, con
     add_json(parser)
 
 
+def send_request(command: str, endpoint: str, key: str | None, **arguments: Any) -> dict[str, Any]:
+    """Return the daemon's answer to a request; errors end the command."""
+    with failing(2, ValueError), failing(1, OSError, RuntimeError):
+        timeout_s = SHORT_TIMEOUT_S
+        if command in SLOW_COMMANDS:  # report a missing daemon without the long timeout
+            request("scene", endpoint=endpoint, key=key, timeout_s=timeout_s)
+            timeout_s = LONG_TIMEOUT_S
+        return request(command, endpoint=endpoint, key=key, timeout_s=timeout_s, **arguments)
+
+
+def print_answer(answer: Reply, as_json: bool, format_lines: Callable[[Reply], Iterable[str]]) -> int:
+    """Print an answer as JSON or as lines; return exit status 0."""
+    if as_json:
+        print_json(answer)
+    else:
+        for line in format_lines(answer):
+            print(line)
+    return 0
+
+
 def run_tare(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str]) -> int:
     """`handtouch tare`: exit status 1 if a pad could not be tared."""
-    target = ControlTarget(endpoint, key, as_json)
-    return target.request_and_print(
-        "tare",
-        lambda answer: map(_tare_line, answer["pads"]),
-        lambda answer: all(pad["tared"] for pad in answer["pads"]),
-        long=True,
-        pads=list(pads),
-    )
+    answer = send_request("tare", endpoint, key, pads=list(pads))
+    print_answer(answer, as_json, lambda answer: map(_tare_line, answer["pads"]))
+    return 0 if all(pad["tared"] for pad in answer["pads"]) else 1
 
 
 def run_scene(endpoint: str, key: str | None, as_json: bool, **values: Any) -> int:
     """`handtouch scene`: show the scenes, or change one; values that are None are left unchanged."""
     changes = {name: value for name, value in values.items() if value is not None}
-    return ControlTarget(endpoint, key, as_json).request_and_print("scene", scene_lines, **changes)
+    return print_answer(send_request("scene", endpoint, key, **changes), as_json, scene_lines)
 
 
 def run_snapshot(endpoint: str, key: str | None, as_json: bool) -> int:
     """`handtouch snapshot`: the present state of all pads; as JSON with columns as lists."""
-    return ControlTarget(endpoint, key, as_json).request_and_print("snapshot", _snapshot_lines)
+    return print_answer(_with_arrays(send_request("snapshot", endpoint, key)), as_json, _snapshot_lines)
 
 
 def run_calibrate(endpoint: str, key: str | None, as_json: bool, pad: str, **values: Any) -> int:
     """`handtouch calibrate` without a measurement: set gains, offsets or law, or print the active ones."""
-    target = ControlTarget(endpoint, key, as_json)
-    return target.request_and_print("calibrate", _calibration_lines, pad=pad, **values)
+    return print_answer(
+        send_request("calibrate", endpoint, key, pad=pad, **values), as_json, _calibration_lines
+    )
 
 
 def run_enable(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str]) -> int:
     """`handtouch enable`."""
-    return _switch(ControlTarget(endpoint, key, as_json), "enable", pads, None)
+    answer = send_request("enable", endpoint, key, pads=list(pads), name=user_name())
+    return print_answer(answer, as_json, _disabled_lines)
 
 
 def run_disable(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str], name: str | None) -> int:
     """`handtouch disable`."""
-    return _switch(ControlTarget(endpoint, key, as_json), "disable", pads, name)
+    answer = send_request("disable", endpoint, key, pads=list(pads), name=name or user_name())
+    return print_answer(answer, as_json, _disabled_lines)
 
 
 def run_reload(endpoint: str, key: str | None, as_json: bool, dry_run: bool) -> int:
     """`handtouch reload`: make the daemon read its deployment file again."""
-    target = ControlTarget(endpoint, key, as_json)
-    return target.request_and_print("reload", _reload_lines, long=True, dry_run=dry_run)
+    return print_answer(send_request("reload", endpoint, key, dry_run=dry_run), as_json, _reload_lines)
 
 
 def run_log(endpoint: str, key: str | None, as_json: bool, level: str) -> int:
     """`handtouch log`: set the daemon's log level."""
-    return ControlTarget(endpoint, key, as_json).request_and_print(
-        "log", lambda answer: [f"log level {answer['level']}, was {answer['previous_level']}"], level=level
-    )
+    return print_answer(send_request("log", endpoint, key, level=level), as_json, _log_lines)
 
 
-@dataclass(frozen=True)
-class ControlTarget:
-    """A control endpoint with its key, and the format of the output."""
-
-    endpoint: str
-    key: str | None
-    as_json: bool
-
-    def request_and_print(
-        self,
-        command: str,
-        format_lines: Callable[[Reply], Iterable[str]],
-        is_ok: Callable[[Reply], bool] = lambda _: True,
-        long: bool = False,
-        **arguments: Any,
-    ) -> int:
-        """Send a request, print the answer and return the exit status; `long`: it may take a while."""
-        try:
-            if long:  # report a missing daemon without the long timeout
-                request("scene", endpoint=self.endpoint, key=self.key, timeout_s=_SHORT_TIMEOUT_S)
-            timeout_s = _LONG_TIMEOUT_S if long else _SHORT_TIMEOUT_S
-            answer = request(command, endpoint=self.endpoint, key=self.key, timeout_s=timeout_s, **arguments)
-        except (OSError, RuntimeError) as error:
-            print(error, file=sys.stderr)
-            return 1
-        except ValueError as error:
-            print(error, file=sys.stderr)
-            return 2
-        if self.as_json:
-            print_json(to_json_lists(answer))
-        else:
-            for line in format_lines(answer):
-                print(line)
-        return 0 if is_ok(answer) else 1
-
-
-def _switch(target: ControlTarget, command: str, pads: Sequence[str], name: str | None) -> int:
-    return target.request_and_print(command, _disabled_lines, pads=list(pads), name=name or user_name())
-
-
-def to_json_lists(answer: Reply) -> dict[str, Any]:
-    """Convert an answer for JSON: columns of a snapshot become lists, NaN becomes None."""
-    if "hands" not in answer:
-        return dict(answer)
-    columns = wire.COLUMNS[wire.HandFrame]
-    hands = {
-        name: {
-            key: _column_rows(columns[key], value) if key in columns else value
-            for key, value in frame.items()
-        }
-        for name, frame in answer["hands"].items()
-    }
-    return {**answer, "hands": hands}
-
-
-def _column_rows(column: wire.Column, data: bytes) -> list[Any]:
-    """Return the rows of a column, NaN as None."""
-    rows = column.to_array(data).tolist()
-    if column.elements == 1:
-        return [_none_if_nan(value) for value in rows]
-    return [[_none_if_nan(value) for value in row] for row in rows]
-
-
-def _none_if_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _log_lines(answer: Reply) -> Iterator[str]:
+    yield f"log level {answer['level']}, was {answer['previous_level']}"
 
 
 def _tare_line(pad: Reply) -> str:
@@ -244,7 +194,7 @@ def _tare_line(pad: Reply) -> str:
     return f"{name}: tared at {counts} counts ({pad['samples']} samples)"
 
 
-def _calibration_lines(answer: Reply) -> Iterable[str]:
+def _calibration_lines(answer: Reply) -> Iterator[str]:
     active, previous = answer["calibration_id"], answer["previous_calibration_id"]
     was = "" if previous == active else f", was {previous}"
     yield f"{answer['hand']}/{answer['link']}: calibration {active}{was}"
@@ -258,11 +208,21 @@ def _calibration_lines(answer: Reply) -> Iterable[str]:
     )
 
 
-def _snapshot_lines(answer: Reply) -> Iterable[str]:
+def _with_arrays(answer: Reply) -> Reply:
+    """Return an answer to `snapshot` with its columns as arrays."""
+    columns = wire.COLUMNS[wire.HandFrame]
+    hands = {
+        name: {key: columns[key].to_array(value) if key in columns else value for key, value in frame.items()}
+        for name, frame in answer["hands"].items()
+    }
+    return {**answer, "hands": hands}
+
+
+def _snapshot_lines(answer: Reply) -> Iterator[str]:
     contacts = {(contact["hand"], contact["link"]): contact for contact in answer["contacts"]}
-    for hand, frame in to_json_lists(answer)["hands"].items():
+    for hand, frame in answer["hands"].items():
         for link, state in zip(frame["links"], frame["state"], strict=True):
-            line = f"{hand}/{link}: {wire.PadState(state).name.lower()}"
+            line = f"{hand}/{link}: {wire.PadState(state).text}"
             if contact := contacts.get((hand, link)):
                 line += _contact_suffix(contact)
             yield line
@@ -274,14 +234,14 @@ def _contact_suffix(contact: Reply) -> str:
     return at + (f" with {force:.2f} N" if force is not None else "") + f" for {contact['duration_s']:.1f} s"
 
 
-def _disabled_lines(answer: Reply) -> Iterable[str]:
+def _disabled_lines(answer: Reply) -> Iterator[str]:
     if not answer["disabled"]:
         yield "all pads are enabled"
     for name, by in answer["disabled"].items():
         yield f"{name}: disabled by {by}"
 
 
-def _reload_lines(answer: Reply) -> Iterable[str]:
+def _reload_lines(answer: Reply) -> Iterator[str]:
     would = "" if answer["applied"] else "would be "
     for table in answer["tables"]:
         yield f"[{table}]: {would}changed"
@@ -289,3 +249,36 @@ def _reload_lines(answer: Reply) -> Iterable[str]:
         yield f"{name}: {would}changed: {', '.join(keys)}"
     if not answer["tables"] and not answer["pads"]:
         yield "no changes"
+
+
+def scene_lines(answer: Reply) -> Iterator[str]:
+    """Format the daemon's answer to `scene`: active scenes, then pads grouped by their outputs."""
+    for scene in answer["scenes"]:
+        rate = "every SYNC" if scene["rate_hz"] is None else f"{scene['rate_hz']:g} Hz"
+        lease = "" if scene["lease_s"] is None else f"; expires in {scene['lease_s']:.0f} s"
+        yield (
+            f"scene of {scene['owner']}: links {', '.join(scene['links']) or 'none'}; "
+            f"{', '.join(scene['outputs']) or 'touched only'}; {rate}{lease}"
+        )
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for pad in answer["pads"]:
+        alike.setdefault(_pad_text(pad), []).append(f"{pad['hand']}/{pad['link']}")
+    for (computed, not_computed, clients), names in alike.items():
+        shown = ", ".join(names[:_MAX_NAMES]) + (
+            f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+        )
+        yield f"{shown}: computed {computed}{clients}{not_computed}"
+
+
+def _pad_text(pad: Reply) -> tuple[str, ...]:
+    reasons: dict[str, list[str]] = {}
+    for output, reason in pad["not_computed"].items():
+        reasons.setdefault(reason, []).append(output)
+    not_computed = "; ".join(f"{', '.join(outputs)} ({reason})" for reason, outputs in reasons.items())
+    rate = f" at {pad['rate_hz']:g} Hz" if pad["computed"] else ""
+    clients = [*pad["scenes"], *(f"subscriber to {prefix or 'all'}" for prefix in pad["subscriptions"])]
+    return (
+        (", ".join(pad["computed"]) or "nothing") + rate,
+        f"; not computed {not_computed}" if not_computed else "",
+        f", for {', '.join(clients)}" if clients and pad["computed"] else "",
+    )

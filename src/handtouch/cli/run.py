@@ -1,9 +1,8 @@
-"""`handtouch run`: run the daemon and report why it can't start."""
+"""`handtouch run`: run the daemon."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,9 +19,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_command(config_path: Path, buses: Sequence[str]) -> int:
     """Run the daemon; exit status 1 if buses or endpoints can't be opened, 2 for wrong configuration."""
-    try:
-        serve.run(config_path, tuple(buses))
-    except serve.StartError as error:
-        print(error, file=sys.stderr)
-        return 2 if error.permanent else 1
+    serve.run(config_path, buses)
     return 0

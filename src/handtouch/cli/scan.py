@@ -15,7 +15,6 @@ from rich.table import Table
 from rich.text import Text
 
 from handtouch import config
-from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_channels_of_node
 from handtouch.canbus.find.traffic import describe_identifier
 from handtouch.cli.options import add_bus, add_config, add_json, integer, positive_number
@@ -102,18 +101,9 @@ def run_scan(
     config_path: Path | None, buses: Sequence[str], request: ScanRequest, *, as_json: bool = False
 ) -> int:
     """Run a scan as requested, print its result and return the exit status."""
-    try:
-        deployment = None if config_path is None else config.load(config_path)
-        scanned = buses_to_scan(deployment, buses)
-    except config.ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    try:
-        with ProgressLine() as progress:
-            reports = scan_buses(scanned, request, deployment, progress.update)
-    except BusError as error:
-        print(error, file=sys.stderr)
-        return 1
+    deployment = None if config_path is None else config.load(config_path)
+    with ProgressLine() as progress:
+        reports = scan_buses(buses_to_scan(deployment, buses), request, deployment, progress.update)
     comparisons = compare_nodes(deployment, reports)
     ok = not any(comparison.problem for comparison in comparisons)
     ok = ok and not any(report.problems for report in reports)

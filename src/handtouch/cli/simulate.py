@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -12,8 +11,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from handtouch import config
-from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.nodes.spec import check_nodes
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_bus, add_config, positive_number
 from handtouch.config import shipped
 from handtouch.config.problems import ConfigError
@@ -85,8 +84,6 @@ def _scenario_texts() -> str:
 
 
 def _existing_scenario(name: str) -> Path:
-    from handtouch.config import shipped
-
     if not (path := shipped.scenario_path(name)).is_file():
         raise argparse.ArgumentTypeError(f"{name}: is neither a file nor one of {', '.join(SCENARIOS)}")
     return path
@@ -147,8 +144,7 @@ def run_command(
 ) -> int:
     """Run the command with the world of its options; the others are those of `run`."""
     if gripper and sheet:
-        print("--gripper excludes --sheet, which needs the contacts in advance", file=sys.stderr)
-        return 2
+        raise CommandError("--gripper excludes --sheet, which needs the contacts in advance", 2)
     hidden = world_with(WORLDS[world], sheet=sheet, drift=drift)
     if gripper:
         hidden = hidden.with_sheets()
@@ -176,10 +172,8 @@ def run(
     `config.with_bus` does. Exit status 0; 1 for a bus, endpoint or file that can't be opened; 2 for a mistake
     in the deployment or scenario.
     """
-    try:
-        deployment = config.load(config_path)
-        for other in buses:
-            deployment = config.with_bus(deployment, other)
+    with failing(2, ValueError):  # ConfigError, or an EDS that can't be simulated
+        deployment = config.load(config_path, buses)
         check_nodes(deployment, str(config_path))
         world = world or WORLDS["ideal"].draw(1)
         if gripper and truth:
@@ -192,24 +186,12 @@ def run(
         else:
             stimulus = Scenario.load(scenario) if scenario else _default_scenario(deployment)
         hand = SimulatedHand.open(deployment, stimulus, world, record=truth is not None)
-    except BusError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except ValueError as error:  # ConfigError, or an EDS that can't be simulated
-        print(error, file=sys.stderr)
-        return 2
     with hand, contextlib.ExitStack() as stack:
-        try:
+        with failing(1, ValueError, prefix="--gripper "):
             if isinstance(stimulus, GripperStimulus) and gripper:
                 hand.serve_gripper(stimulus, gripper)
-        except ValueError as error:
-            print(f"--gripper {error}", file=sys.stderr)
-            return 1
-        try:
+        with failing(1, OSError):
             file = stack.enter_context(truth.open("w", encoding="utf-8")) if truth else None
-        except OSError as error:
-            print(f"{truth}: {error.strerror}", file=sys.stderr)
-            return 1
         hand.publish_joints(deployment, stimulus, deployment.daemon.inputs.replace("//*:", "//127.0.0.1:"))
         _serve(hand, deployment, file, seconds, stop or stop_on_signals(), status_period_s)
     return 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,10 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from handtouch.cli.options import add_endpoint, add_json
-from handtouch.cli.scene_text import scene_lines
+from handtouch.cli.requests import add_request, scene_lines, send_request
 from handtouch.cli.tables import make_table, output_console, print_table
-from handtouch.client import CONTROL_ENDPOINT, request
 from handtouch.host.json_output import print_json
 from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
 
@@ -45,30 +42,15 @@ _VERBOSE_COLUMNS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `status`."""
-    parser.set_defaults(command=run)
-    add_endpoint(parser, "control")
-    add_json(parser)
+    add_request(parser, run)
     parser.add_argument(
         "-v", "--verbose", action="store_true", help="also timing, buses' counters, scenes and nodes"
     )
 
 
-def run(
-    *,
-    endpoint: str = CONTROL_ENDPOINT,
-    key: str | None = None,
-    as_json: bool = False,
-    verbose: bool = False,
-) -> int:
+def run(*, endpoint: str, key: str | None, as_json: bool, verbose: bool) -> int:
     """Print the status; exit status 0 (pads and store ok), 1 (not all, or no daemon), 2 (usage)."""
-    try:
-        answer = request("status", endpoint=endpoint, key=key)
-    except (OSError, RuntimeError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
+    answer = send_request("status", endpoint, key)
     if as_json:
         print_json(answer)
     else:

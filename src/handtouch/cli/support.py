@@ -26,6 +26,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from handtouch import __version__, config
+from handtouch.cli.errors import CommandError
 from handtouch.cli.options import add_config, add_key, add_output, positive_number
 from handtouch.client import CONTROL_ENDPOINT, request
 from handtouch.core.compiled import Compilation
@@ -89,8 +90,7 @@ def run(config_path: Path | None, out: Path | None, seconds: float, logs: list[P
                 out.unlink()
                 raise
     except OSError as error:
-        print(f"{out}: {error.strerror or error}; name another file with -o", file=sys.stderr)
-        return 2
+        raise CommandError(f"{out}: {error.strerror or error}; name another file with -o", 2) from error
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; secrets are removed, but read it before you send it")
     return 1 if missing else 0
 

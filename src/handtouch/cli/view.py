@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import threading
 import time
 import webbrowser
+from contextlib import ExitStack
+from typing import Any
 
+from handtouch.cli.errors import CommandError, failing, needing
 from handtouch.cli.options import add_endpoint, add_percepts, integer, positive_number
 from handtouch.client import connect
 from handtouch.host.endpoints import is_loopback
-from handtouch.host.installation import extra_command
 from handtouch.host.signals import stop_on_signals
 from handtouch.view import page
-from handtouch.view.page.model import PageModel
-from handtouch.view.page.server import PageServer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,89 +59,34 @@ def run(
     without the extra.
     """
     if not is_loopback(host):
-        print(
+        raise CommandError(
             f"--host {host}: is reachable from other machines, and HTTP has no keys; leave it out, and open "
             "an SSH tunnel on the other machine: ssh -L 5588:localhost:5588 ROBOT",
-            file=sys.stderr,
+            2,
         )
-        return 2
     stop = stop_on_signals()
+    end_s = time.monotonic() + seconds if seconds else float("inf")
+    shown: Any = page
     if foxglove:
-        return _serve_foxglove(endpoint, key, host, port, show, seconds, percepts, stop)
-    port = page.PORT if port is None else port
-    model = PageModel(percepts)
-    server = PageServer(model.values, host, port)
-    try:
-        messages = connect(*page.patterns(percepts), endpoint=endpoint, key=key, queue=page.QUEUE_MESSAGES)
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
-    with messages:
+        with needing("foxglove", "Foxglove's package is missing: "):
+            from handtouch.view import foxglove as shown
+    port = shown.PORT if port is None else port
+    patterns = (*shown.PATTERNS, *[page.PERCEPT_PATTERN] * percepts)
+    with failing(2, ValueError):
+        messages = connect(*patterns, endpoint=endpoint, key=key, queue=shown.QUEUE_MESSAGES)
+    with messages, ExitStack() as stack:
         try:
-            server.start()
-        except (OSError, OverflowError) as error:
-            print(_bind_error_text(host, port, error), file=sys.stderr)
-            return 2
-        print(f"handtouch view: {server.url} shows {endpoint}; Ctrl-C to stop", flush=True)
+            server = stack.enter_context(shown.open_server(host, port, percepts))
+        except (OSError, OverflowError, RuntimeError) as error:
+            raise CommandError(
+                f"can't serve at {host}:{port}: {getattr(error, 'strerror', None) or error}; if another view "
+                "uses the port, take a free one with `handtouch view --port 0`",
+                2,
+            ) from error
+        where = f" in {server.app_url}" if foxglove else ""
+        print(f"handtouch view: {server.url} shows {endpoint}{where}; Ctrl-C to stop", flush=True)
         if show:
-            webbrowser.open(server.url)
-        try:
-            end_s = time.monotonic() + seconds if seconds else float("inf")
-            page.serve(messages, model, server, stop, end_s)
-        except PermissionError as error:
-            print(error, file=sys.stderr)
-            return 1
-        finally:
-            server.close()
+            webbrowser.open(server.app_url if foxglove else server.url)
+        with failing(1, PermissionError):
+            shown.serve(messages, server, stop, end_s)
     return 0
-
-
-def _serve_foxglove(
-    endpoint: str,
-    key: str | None,
-    host: str,
-    port: int | None,
-    show: bool,
-    seconds: float,
-    percepts: bool,
-    stop: threading.Event,
-) -> int:
-    try:
-        from handtouch.view import foxglove
-    except ImportError as error:
-        print(f"Foxglove's package is missing ({error}): {extra_command('foxglove')}", file=sys.stderr)
-        return 2
-    patterns = (*foxglove.PATTERNS, *[page.PERCEPT_PATTERN] * percepts)
-    port = foxglove.PORT if port is None else port
-    try:
-        messages = connect(*patterns, endpoint=endpoint, key=key, queue=foxglove.QUEUE_MESSAGES)
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
-    with messages:
-        try:
-            server = foxglove.FoxgloveServer(host, port)
-        except RuntimeError as error:
-            print(_bind_error_text(host, port, error), file=sys.stderr)
-            return 2
-        with server:
-            print(
-                f"handtouch view: {server.url} shows {endpoint} in {server.app_url}; Ctrl-C to stop",
-                flush=True,
-            )
-            if show:
-                webbrowser.open(server.app_url)
-            end_s = time.monotonic() + seconds if seconds else float("inf")
-            try:
-                foxglove.serve(messages, server, stop, end_s)
-            except PermissionError as error:
-                print(error, file=sys.stderr)
-                return 1
-    return 0
-
-
-def _bind_error_text(host: str, port: int, error: Exception) -> str:
-    return (
-        f"can't serve at {host}:{port}: {getattr(error, 'strerror', None) or error}; if another "
-        "view uses the port, take a free one with `handtouch view --port 0`"
-    )

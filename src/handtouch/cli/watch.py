@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 
+from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_endpoint, positive_number
 from handtouch.client import UnknownNameError, connect
 from handtouch.view.displays import Display, LineDisplay, LiveDisplay, show_messages
@@ -54,24 +55,18 @@ def run(
     live = style == "auto" and sys.stdout.isatty() and not patterns
     default = ("contact/*/*", "health/*/*", "service") if live else ("contact/*/*", "health/*/*")
     end_s = time.monotonic() + seconds if seconds else float("inf")
-    try:
+    with failing(2, ValueError):
         messages = connect(*(patterns or default), endpoint=endpoint, key=key)
-    except ValueError as error:
-        print(error, file=sys.stderr)
-        return 2
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() and not wide else None
     display: Display = (
         LiveDisplay(f"handtouch at {endpoint}") if live else LineDisplay(style == "json", columns)
     )
     try:
-        with messages, display:
+        with failing(1, PermissionError, UnknownNameError), messages, display:
             show_messages(messages, display, lambda: time.monotonic() > end_s)
             has_received = messages.has_received
     except KeyboardInterrupt:  # the usual end
         return 0
-    except (PermissionError, UnknownNameError) as error:
-        print(error, file=sys.stderr)
-        return 1
     if not has_received:
-        print(messages.connection.reason_of_silence, file=sys.stderr)
-    return 0 if has_received else 1
+        raise CommandError(messages.connection.reason_of_silence, 1)
+    return 0

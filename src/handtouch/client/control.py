@@ -20,7 +20,7 @@ from handtouch.host.endpoints import CONTROL_ENDPOINT
 
 Output = Literal["position", "force", "palm", "base", "raw", "motion", "shape", "friction"]
 SHORT_TIMEOUT_S, LONG_TIMEOUT_S = 3.0, 60.0
-_SLOW_COMMANDS = ("tare", "reload")
+SLOW_COMMANDS = ("tare", "reload")
 M = TypeVar("M")
 
 
@@ -217,7 +217,7 @@ class DaemonControl:
         return dict(self._request(command, pads=list(pads), **by)["disabled"])
 
     def _request(self, command: str, **arguments: Any) -> dict[str, Any]:
-        timeout_s = LONG_TIMEOUT_S if command in _SLOW_COMMANDS else SHORT_TIMEOUT_S
+        timeout_s = LONG_TIMEOUT_S if command in SLOW_COMMANDS else SHORT_TIMEOUT_S
         return request(command, endpoint=self.endpoint, key=self._key, timeout_s=timeout_s, **arguments)
 
 

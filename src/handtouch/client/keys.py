@@ -30,6 +30,8 @@ _KEY_PATTERN = re.compile(r"[0-9A-Za-z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 o
 class KeyFileError(ValueError):
     """An unusable key or key file; the text includes the remedy."""
 
+    exit_status = 2
+
 
 @dataclass(frozen=True)
 class ServerKey:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -66,13 +66,17 @@ __all__ = [
 ]
 
 
-def load(path: Path | str) -> Deployment:
+def load(path: Path | str, buses: Iterable[str] = ()) -> Deployment:
     """Read and check a deployment file; paths in it are relative to its folder.
 
-    Raises ConfigError with every error, also for a file that can't be read or isn't TOML.
+    `buses`: other interfaces, as for `with_bus`. Raises ConfigError with every error, also for a file that
+    can't be read or isn't TOML.
     """
     path = Path(path)
-    return parse(read_text(path, "a deployment file"), str(path), path.parent)
+    deployment = parse(read_text(path, "a deployment file"), str(path), path.parent)
+    for text in buses:
+        deployment = with_bus(deployment, text)
+    return deployment
 
 
 def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) -> Deployment:

@@ -58,6 +58,8 @@ _log = logging.getLogger(__name__)
 class EdsError(ValueError):
     """An EDS can't be used; `str` is "file:line: problem; remedy", the line where known."""
 
+    exit_status = 2
+
 
 class EdsVariable(ODVariable):  # type: ignore[misc]  # canopen is untyped
     """Variable of a file; `location` is "file:line" of its type."""

@@ -52,6 +52,8 @@ class Problem:
 class ConfigError(ValueError):
     """A deployment file that can't be used; `problems` holds every error, `str` has a line for each kind."""
 
+    exit_status = 2
+
     def __init__(self, file: str, problems: tuple[Problem, ...]) -> None:
         super().__init__("\n".join(f"{file}: {line}" for line in _lines(problems)))
         self.file = file

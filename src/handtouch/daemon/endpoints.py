@@ -1,6 +1,6 @@
 """ZeroMQ endpoints of the daemon: bind a socket with access control, or raise an error that names a remedy.
 
-Public names: `bind_endpoint`, `remove_socket_file`, `is_readable`.
+Public names: `EndpointError`, `bind_endpoint`, `remove_socket_file`, `is_readable`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,12 @@ from handtouch.host.endpoints import check_ipc_path
 _EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)  # looking up enumeration members costs more
 
 
+class EndpointError(OSError):
+    """An endpoint that can't be opened; the text names purpose, endpoint and remedy."""
+
+    exit_status = 1
+
+
 class SocketGuard(Protocol):
     """Sets message-size limits and access control of a socket: `Authenticator`."""
 
@@ -28,24 +34,20 @@ def bind_endpoint(
     """Bind a socket and return its endpoint with the real port; close the socket if that fails.
 
     `right` is what clients need to connect: "read", "control" or "inputs" (granted with "control").
-    Raises OSError naming purpose, endpoint and remedy.
+    Raises EndpointError.
     """
     try:
-        try:
-            check_ipc_path(endpoint)
-        except OSError as error:
-            raise OSError(f"{purpose} can't be opened at {endpoint}: {error}") from error
+        check_ipc_path(endpoint)
         guard.secure_socket(socket, endpoint, right)
-        try:
-            socket.bind(endpoint)
-        except zmq.ZMQError as error:
-            raise OSError(
-                f"{purpose} can't be opened at {endpoint}: {error.strerror}; is another daemon running "
-                "there? Run `handtouch doctor CONFIG` to check, or set another endpoint in [daemon]"
-            ) from error
-    except OSError:
+        socket.bind(endpoint)
+    except (OSError, zmq.ZMQError) as error:
         socket.close()
-        raise
+        remedy = (
+            "; is another daemon running there? Run `handtouch doctor CONFIG` to check, or set another "
+            "endpoint in [daemon]"
+        )
+        why = f"{error.strerror}{remedy}" if isinstance(error, zmq.ZMQError) else error
+        raise EndpointError(f"{purpose} can't be opened at {endpoint}: {why}") from error
     return socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
 

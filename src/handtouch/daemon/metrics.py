@@ -16,6 +16,7 @@ import sys
 import threading
 
 from handtouch import wire
+from handtouch.daemon.endpoints import EndpointError
 
 _RESTART_DELAY_S = 2.0
 _log = logging.getLogger("handtouch.metrics")
@@ -42,12 +43,12 @@ class MetricsExporter:
 
     @classmethod
     def open(cls, address: str) -> MetricsExporter:
-        """Listen at HOST:PORT and start the server process. Raises OSError naming address and remedy."""
+        """Listen at HOST:PORT and start the server process. Raises EndpointError."""
         host, _, port = address.rpartition(":")
         try:
             listener = socket.create_server((host, int(port)))
         except OSError as error:
-            raise OSError(
+            raise EndpointError(
                 f"[daemon] metrics can't be served at {address}: {error.strerror}; is another daemon running "
                 "there? Set another port, or remove the key"
             ) from error

@@ -1,6 +1,6 @@
 """Start of `handtouch run`: deployment file, logging, metrics, real-time settings, systemd.
 
-Public names: `run`, `StartError`.
+Public name: `run`.
 """
 
 from __future__ import annotations
@@ -9,16 +9,13 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
-from handtouch.canbus.bus.port import BusError
 from handtouch.canbus.nodes.spec import check_nodes
-from handtouch.client.keys import KeyFileError
-from handtouch.config import ConfigError, Deployment, load, with_bus
-from handtouch.config.eds import EdsError
+from handtouch.config import Deployment, load
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.metrics import MetricsExporter
 from handtouch.daemon.metrics_page import METRICS_PATH
@@ -32,20 +29,13 @@ _log = logging.getLogger("handtouch.daemon")
 _GIL_SWITCH_INTERVAL_S = 0.0005  # limits how long a thread that boots a node or builds a model holds the GIL
 
 
-class StartError(Exception):
-    """The daemon can't start; `permanent` if a restart can't help, as with a wrong configuration."""
+def run(config_path: Path, buses: Sequence[str] = ()) -> None:
+    """Serve a deployment until SIGINT or SIGTERM.
 
-    def __init__(self, error: Exception, *, permanent: bool) -> None:
-        super().__init__(str(error))
-        self.permanent = permanent
-
-
-def run(config_path: Path, buses: tuple[str, ...] = ()) -> None:
-    """Serve a deployment until SIGINT or SIGTERM. Raises StartError."""
-    try:
-        deployment = _read_deployment(config_path, buses)
-    except ConfigError as error:
-        raise StartError(error, permanent=True) from error
+    Raises ConfigError, EdsError, KeyFileError for wrong files, where a restart can't help; BusError,
+    EndpointError for what can't be opened.
+    """
+    deployment = _read_deployment(config_path, buses)
     stop = stop_on_signals()
     log_handler = logs.start_logging(deployment.daemon.log_level)
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master logs these events itself
@@ -62,17 +52,12 @@ def _serve(
     sys.setswitchinterval(_GIL_SWITCH_INTERVAL_S)
     with ExitStack() as stack:
         notifier = stack.enter_context(closing(SystemdNotifier.open()))
-        try:
-            exporter = None
-            if settings.metrics is not None:
-                exporter = stack.enter_context(closing(MetricsExporter.open(settings.metrics)))
-            on_message = exporter.send if exporter is not None else None
-            daemon = HandtouchDaemon.open(deployment, read=read, folder=folder, on_message=on_message)
-            stack.enter_context(daemon)
-        except (KeyFileError, EdsError) as error:
-            raise StartError(error, permanent=True) from error
-        except (BusError, OSError) as error:
-            raise StartError(error, permanent=False) from error
+        exporter = None
+        if settings.metrics is not None:
+            exporter = stack.enter_context(closing(MetricsExporter.open(settings.metrics)))
+        on_message = exporter.send if exporter is not None else None
+        daemon = HandtouchDaemon.open(deployment, read=read, folder=folder, on_message=on_message)
+        stack.enter_context(daemon)
         _log_endpoints(daemon)
         if exporter is not None:
             _log.info("metrics: http://%s%s", exporter.address, METRICS_PATH)
@@ -83,11 +68,9 @@ def _serve(
         notifier.send("STOPPING=1")
 
 
-def _read_deployment(config_path: Path, buses: tuple[str, ...]) -> Deployment:
+def _read_deployment(config_path: Path, buses: Sequence[str]) -> Deployment:
     """Read a deployment, with other buses if given; drop URDFs that don't fit. Raises ConfigError."""
-    deployment = load(config_path)
-    for bus in buses:
-        deployment = with_bus(deployment, bus)
+    deployment = load(config_path, buses)
     deployment = check_nodes(deployment, str(config_path))  # report mistakes before a bus is opened
     deployment, problems = drop_invalid_urdfs(deployment, str(config_path))
     for problem in problems:

@@ -44,6 +44,8 @@ class AdcError(Exception):
     `number` : errno, 0 without
     """
 
+    exit_status = 1
+
     def __init__(self, kind: AdcFaultKind, text: str, number: int = 0) -> None:
         super().__init__(f"{kind.text}: {text}")
         self.kind, self.number = kind, number

@@ -6,7 +6,7 @@ Public names: `load_deployment`, `summary`, `find_warnings`, `worst_bus_load`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,9 @@ MIN_USUAL_COUNTS = 50
 _ANY_FORCE_N = 1e3
 
 
-def load_deployment(path: Path) -> config.Deployment:
+def load_deployment(path: Path, buses: Iterable[str] = ()) -> config.Deployment:
     """Load a deployment and check its node objects and robot descriptions too. Raises ConfigError."""
-    return check_urdfs(check_nodes(config.load(path), str(path)), str(path))
+    return check_urdfs(check_nodes(config.load(path, buses), str(path)), str(path))
 
 
 def summary(deployment: config.Deployment) -> dict[str, Any]:

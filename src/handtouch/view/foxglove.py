@@ -1,6 +1,6 @@
 """The hand in Foxglove, live: a subscriber that serves the topics of a recording over Foxglove's WebSocket.
 
-Public names: `FoxgloveServer`, `serve`, `PATTERNS`. Needs the extra `foxglove`.
+Public names: `FoxgloveServer`, `open_server`, `serve`, `PATTERNS`. Needs the extra `foxglove`.
 """
 
 from __future__ import annotations
@@ -84,6 +84,11 @@ class FoxgloveServer:
 def _hidden_address() -> str:
     """Return a loopback address for Foxglove's own server, which checks no Origin: a page can't guess it."""
     return ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
+
+
+def open_server(host: str, port: int, percepts: bool) -> FoxgloveServer:  # noqa: ARG001
+    """Listen at an address. Raises RuntimeError if it can't be used."""
+    return FoxgloveServer(host, port)
 
 
 def serve(messages: Subscriber[Any], server: FoxgloveServer, stop: threading.Event, end_s: float) -> None:

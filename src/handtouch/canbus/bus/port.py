@@ -46,6 +46,8 @@ _INTERFACES_WITHOUT_BITRATE = frozenset({"socketcan", "udp_multicast", "virtual"
 class BusError(OSError):
     """A bus can't be opened; `str` names the bus, its interface and channel, and a remedy."""
 
+    exit_status = 1
+
 
 class Port:
     """A bus in use. Receive in one thread; `send` may be called from any thread.

@@ -12,9 +12,15 @@ from collections.abc import Sequence
 from handtouch import client, config
 from handtouch.host.endpoints import to_connect
 
-__all__ = ["daemon_is_running", "select_rows"]
+__all__ = ["DaemonRunningError", "refuse_beside_daemon", "select_rows"]
 
 _DAEMON_TIMEOUT_S = 0.5
+
+
+class DaemonRunningError(Exception):
+    """A daemon uses the buses that a procedure needs."""
+
+    exit_status = 1
 
 
 def select_rows(deployment: config.Deployment, patterns: Sequence[str]) -> list[int]:
@@ -46,12 +52,15 @@ def select_rows(deployment: config.Deployment, patterns: Sequence[str]) -> list[
     return sorted(rows)
 
 
-def daemon_is_running(endpoint: str) -> bool:
-    """Check whether a daemon, which would use the same buses, answers at a control endpoint."""
+def refuse_beside_daemon(endpoint: str) -> None:
+    """Raise DaemonRunningError if a daemon, which would use the same buses, answers at a control endpoint."""
     try:
         client.request("status", endpoint=to_connect(endpoint), timeout_s=_DAEMON_TIMEOUT_S)
     except TimeoutError:
-        return False
+        return
     except (PermissionError, RuntimeError):
         pass  # it runs, and rejects the request
-    return True
+    raise DaemonRunningError(
+        f"a daemon is running at {endpoint} and uses these buses; stop it first (Ctrl-C, or systemctl stop "
+        "handtouch), and start it again afterwards"
+    )

@@ -34,6 +34,8 @@ _MASTER_NAMES = {
 class BusInUseError(Exception):
     """Another master is active on the bus; `str` names it, with a remedy."""
 
+    exit_status = 1
+
 
 def check_bus_is_free(line: Line, name: str, listen_ns: int = LISTEN_NS) -> set[int]:
     """Listen before the first frame is sent; return the node ids of the heartbeats received.

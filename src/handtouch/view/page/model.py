@@ -92,16 +92,14 @@ class VersionedValues:
 class PageModel:
     """Collects messages by `add_message`; `update_values` writes the resulting state to `values`.
 
-    `percepts`: True if percepts are subscribed; otherwise the page shows how to enable them.
-
     Keys of `values`: `scene` (as `scene_graph.scene_of`), `joints/<hand>`, `pad/<hand>/<link>`,
     `contact/<hand>/<link>` (None: no contact), `percepts/<hand>/<link>` (as `PerceptSummaries.current`),
-    `percepts_enabled`, `service`, `alive`, `messages`, `time_s`.
+    `percepts_enabled` (else the page shows how to subscribe to them), `service`, `alive`, `messages`,
+    `time_s`.
     """
 
-    def __init__(self, percepts: bool = False) -> None:
-        self.values = VersionedValues()
-        self.values.set_value("percepts_enabled", percepts)
+    def __init__(self, values: VersionedValues | None = None) -> None:
+        self.values = VersionedValues() if values is None else values
         self._session: int | None = None
         self._deployment = ""
         self._has_hands = False
