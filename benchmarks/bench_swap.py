@@ -16,7 +16,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,9 +32,8 @@ from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, MountSpread
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
+    NodeSerials,
     SampleBlock,
-    WorkerConfig,
-    pack_serials,
 )
 from handtouch.supervisor.worker import SupervisorWorker
 from tests.deployments import deployment_text, pad_text
@@ -96,7 +94,7 @@ def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
     contact = np.full((TICKS + 1, pads), number + 1, np.uint32)
     contact[-1] = 0
     times = round(first_s * 1e9) + PERIOD_NS * np.arange(TICKS + 1, dtype=np.int64)
-    block = SampleBlock(
+    return SampleBlock(
         times,
         np.repeat(times[:, None], pads, axis=1),
         counts.astype(np.int32),
@@ -109,8 +107,6 @@ def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
         np.full(pads, np.nan),
         np.full(pads, np.nan),
     )
-    message: dict[str, Any] = msgpack.unpackb(block.dump())
-    return message
 
 
 def test_set(
@@ -147,20 +143,13 @@ def run(name: str, units: int, counts: tuple[int, ...]) -> list[dict[str, Any]]:
     exact = ExactPads(deployment, model)
     hand = VirtualHand(deployment, touches(model, max(counts), 3), world)
     readings, places = test_set(deployment, model, world)
-    start = WorkerConfig(
-        deployment,
-        "",
-        tuple(model.default_calibration_ids),
-        model.ampere_per_count.copy(),
-        model.noise_counts,
-    )
     trust = ["default"] * model.size
     deviation = np.full(model.size, np.nan)
     taken: dict[int, tuple[FloatArray, list[str], FloatArray]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        slow = SupervisorWorker(start, StoreClient(Path(folder) / "calibrations.db"))
+        slow = SupervisorWorker(deployment, StoreClient(Path(folder) / "calibrations.db"))
         new, old = [1000 + k for k in range(model.size)], [k + 1 for k in range(model.size)]
-        words = slow.process_message(msgpack.unpackb(pack_serials(new, old, 0)), NOW)
+        words = slow.process_message(NodeSerials(now=tuple(new), before=tuple(old), sync_ns=0), NOW)
         for number in range(max(counts) + 1):
             for word in words:
                 if isinstance(word, CalibrationAssessment):

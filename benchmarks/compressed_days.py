@@ -22,7 +22,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
@@ -34,6 +33,7 @@ from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
 from handtouch import wire
 from handtouch.calibration.store_client import StoreClient
 from handtouch.canbus.nodes.spec import SerialChanged
+from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
@@ -49,7 +49,7 @@ from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.stimulus import NodeReplacement
 from handtouch.simulate.worlds import WORLDS, MountSpread, World
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
-from handtouch.supervisor.ipc import WorkerConfig, pack_worker_message
+from handtouch.supervisor.ipc import pack_message, unpack_daemon_message
 from handtouch.supervisor.worker import SupervisorWorker
 from handtouch.wire import PERCEPT_KINDS, PadState
 from handtouch.wire.status import PositionStatus
@@ -169,6 +169,12 @@ class Days:
             yield times, block.counts, truth
 
 
+def start_message(deployment: Deployment, store: Path) -> bytes:
+    """Return the deployment that the supervisor process gets, with the path of its store."""
+    daemon = deployment.daemon.model_copy(update={"store": str(store)})
+    return deployment.model_copy(update={"daemon": daemon}).model_dump_json(by_alias=True).encode()
+
+
 class InlineSupervisor(ChildProcess):
     """The supervisor's worker in this process, which exchanges the same messages; `crash` ends it at once."""
 
@@ -205,17 +211,17 @@ class InlineSupervisor(ChildProcess):
         self.now_ns = now_ns
         if self.worker is not None or not self.enabled:
             return False
-        start = WorkerConfig.load(self._start)
-        store = StoreClient(Path(start.store))
-        self.worker = SupervisorWorker(start, store, DeploymentDiagnostics(start.deployment))
+        deployment = Deployment.model_validate_json(self._start)
+        store = StoreClient(Path(deployment.daemon.store or ""))
+        self.worker = SupervisorWorker(deployment, store, DeploymentDiagnostics(deployment))
         return True
 
     def send(self, message: bytes) -> bool:
         """Process a message at once."""
         if self.worker is None:
             return False
-        done = self.worker.process_message(msgpack.unpackb(message), wall(self.now_ns))
-        self.waiting += map(pack_worker_message, done)
+        done = self.worker.process_message(unpack_daemon_message(message), wall(self.now_ns))
+        self.waiting += map(pack_message, done)
         return True
 
     def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:
@@ -286,14 +292,7 @@ class Session:
         model = PadModel(deployment)
         self.pipeline = Pipeline(model, PERIOD_NS, 0.8, recording, number)
         self.pipeline.node_state[:] = PadState.CLEAR
-        config_of = WorkerConfig(
-            deployment,
-            str(store),
-            tuple(model.default_calibration_ids),
-            np.array(model.ampere_per_count / model.gains),
-            model.noise_counts,
-        )
-        self.process = InlineSupervisor(config_of.dump())
+        self.process = InlineSupervisor(start_message(deployment, store))
         self.serials: list[int | None] = [None] * model.size
         nodes: Any = SimpleNamespace(status=lambda: [SimpleNamespace(serial=s) for s in self.serials])
         self.supervisor = SupervisorClient(deployment, self.pipeline, nodes, "", self.process)

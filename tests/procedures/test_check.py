@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from handtouch import config
-from handtouch.cli import check as check_command
+from handtouch.cli import main
 from handtouch.config import shipped
 from handtouch.procedures.check import find_warnings
 
@@ -25,7 +25,7 @@ def warnings_of(*changes: tuple[str, str]) -> list[str]:
 
 
 def test_shipped_hand_has_no_warnings(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check_command.run(HAND, as_json=False, schema=False) == 0
+    assert main(["check", str(HAND)]) == 0
     output = capsys.readouterr().out
     assert "15 pads, load 43%" in output
     assert "no warnings" in output
@@ -54,7 +54,7 @@ def test_values_in_another_unit_are_one_warning_for_all_pads(old: str, new: str,
 
 
 def test_json_has_the_same_content(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check_command.run(HAND, as_json=True, schema=False) == 0
+    assert main(["check", str(HAND), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["ok"] is True
     assert report["buses"][0]["load"] == pytest.approx(0.43, abs=0.01)
@@ -74,9 +74,9 @@ def test_sizes_are_those_as_built(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_invalid_file_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("drive_v", "drive"))
-    assert check_command.run(path, as_json=False, schema=False) == 2
+    assert main(["check", str(path)]) == 2
     assert capsys.readouterr().err.startswith(f"{path}: [node.four_channel]: drive = 5.0: unknown key")
-    assert check_command.run(path, as_json=True, schema=False) == 2
+    assert main(["check", str(path), "--json"]) == 2
     report = json.loads(capsys.readouterr().out)
     assert report["ok"] is False
     assert report["problems"][0]["value"] == "5.0"
@@ -85,7 +85,7 @@ def test_invalid_file_exits_with_status_2(tmp_path: Path, capsys: pytest.Capture
 def test_invalid_object_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("drive_v = 5.0", 'drive_v = 5.0\nexcitation_object = "0x2100:0"'))
-    assert check_command.run(path, as_json=False, schema=False) == 2
+    assert main(["check", str(path)]) == 2
     assert capsys.readouterr().err.startswith(
         f'{path}: [node.four_channel]: excitation_object: "0x2100:0": its type'
     )
@@ -111,17 +111,17 @@ def test_an_eds_that_maps_other_objects_is_a_warning_with_what_it_maps(allowed: 
 def test_warnings_exit_with_status_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT.replace("serial = 1001\n", ""))
-    assert check_command.run(path, as_json=False, schema=False) == 1
+    assert main(["check", str(path)]) == 1
     assert "warning: right: no serial for thumb_proximal:" in capsys.readouterr().out
 
 
 def test_schema_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert check_command.run(None, as_json=False, schema=True) == 0
+    assert main(["check", "--schema"]) == 0
     assert json.loads(capsys.readouterr().out) == config.json_schema()
 
 
 def test_missing_arguments_are_wrong_usage() -> None:
-    assert check_command.run(None, as_json=False, schema=False) == 2
+    assert main(["check"]) == 2
 
 
 @pytest.mark.parametrize(

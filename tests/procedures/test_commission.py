@@ -577,5 +577,5 @@ def test_usage_is_checked_before_a_bus_is_opened(tmp_path: Path, capsys: pytest.
     assert cli.main(["commission", str(tmp_path / "none.toml")]) == 2
     assert cli.main(["commission", str(path), "--link", "toe_*"]) == 2
     assert "--link toe_*" in capsys.readouterr().err
-    assert commission_command.run(path, ["can0=socketcan:none0"]) == 1
+    assert cli.main(["commission", str(path), "--bus", "can0=socketcan:none0"]) == 1
     assert "can't be opened" in capsys.readouterr().err

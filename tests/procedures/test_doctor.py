@@ -14,9 +14,8 @@ from typing import Any
 import pytest
 import zmq
 
-from handtouch import config
+from handtouch import cli, config
 from handtouch.canbus.bus.port import BusError, Port, open_bus
-from handtouch.cli import doctor as doctor_command
 from handtouch.client import keys
 from handtouch.config import shipped
 from handtouch.core.slab import Slab
@@ -215,7 +214,7 @@ def test_multicast_group_with_a_route_is_ok(network: list[str]) -> None:
 
 
 def test_json_report_has_remedies(capsys: pytest.CaptureFixture[str]) -> None:
-    status = doctor_command.run(HAND, as_json=True)
+    status = cli.main(["doctor", str(HAND), "--json"])
     checks = json.loads(capsys.readouterr().out)
     assert {"python", "packages", "receive buffer", "bus can0", "endpoint live"} <= {
         check["subject"] for check in checks
@@ -225,7 +224,7 @@ def test_json_report_has_remedies(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_invalid_deployment_exits_with_status_2(tmp_path: Path) -> None:
-    assert doctor_command.run(tmp_path / "none.toml", as_json=False) == 2
+    assert cli.main(["doctor", str(tmp_path / "none.toml")]) == 2
 
 
 @pytest.mark.socketcan

@@ -663,7 +663,7 @@ def test_invalid_options_exit_with_status_2(arguments: list[str]) -> None:
 
 
 def test_missing_bus_exits_with_status_1_and_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert scan_command.run_scan(None, ["a=slcan:/dev/nowhere"], QUICK) == 1
+    assert cli.main(["scan", "--bus", "a=slcan:/dev/nowhere"]) == 1
     assert "/dev/nowhere" in capsys.readouterr().err
 
 

@@ -36,7 +36,7 @@ from handtouch.supervisor.ipc import (
     CalibrationUpdate,
     ContactLawMessage,
     WorkerMessage,
-    pack_worker_message,
+    pack_message,
 )
 from handtouch.wire import PadState
 from handtouch.wire.diagnosis import Diagnosis
@@ -128,7 +128,7 @@ class Session:
         )
 
     def receive(self, *messages: WorkerMessage) -> None:
-        self.worker.waiting += [pack_worker_message(message) for message in messages]
+        self.worker.waiting += [pack_message(message) for message in messages]
 
     def stroke(self, ticks: int, seed: int) -> None:
         for _ in range(ticks // 10):

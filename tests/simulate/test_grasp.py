@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks import grasp_run
 from handtouch import config
-from handtouch.cli import demo
-from handtouch.cli.simulate import run as simulate
+from handtouch.cli import main
 from handtouch.config import shipped
 from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.pads import mount_transform
@@ -282,8 +281,9 @@ def test_impossible_grasp_is_reported_with_a_remedy(monkeypatch: pytest.MonkeyPa
 def test_unknown_object_gives_exit_status_2(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert demo.run(grasp="bottle") == 2
-    assert simulate(shipped.path("utah_mit.toml"), buses=("can0=virtual:grasp",), grasp="bottle") == 2
+    assert main(["demo", "--grasp", "bottle"]) == 2
+    bus = ["--bus", "can0=virtual:grasp"]
+    assert main(["simulate", str(shipped.path("utah_mit.toml")), *bus, "--grasp", "bottle"]) == 2
     assert capsys.readouterr().err.count("--grasp bottle: unknown object") == 2
 
 

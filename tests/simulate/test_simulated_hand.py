@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import threading
 import time
@@ -15,6 +16,7 @@ import pytest
 
 from handtouch import config
 from handtouch.canbus.bus.port import BusError
+from handtouch.cli import main
 from handtouch.cli.simulate import run, run_command
 from handtouch.config.problems import ConfigError
 from handtouch.simulate import simulated_hand
@@ -256,12 +258,13 @@ def test_negative_seed_is_rejected() -> None:
     ],
 )
 def test_simulate_exit_status_for_each_mistake(
-    files: Path, capsys: pytest.CaptureFixture[str], change: dict[str, object], status: int, expected: str
+    files: Path, change: dict[str, object], status: int, expected: str
 ) -> None:
     arguments = {"config_path": "hand.toml", "scenario": "session.toml", "truth": None, **change}
     paths = {key: files / value if isinstance(value, str) else value for key, value in arguments.items()}
-    assert run(**paths, stop=threading.Event(), seconds=0.05) == status  # type: ignore[arg-type]
-    assert expected in capsys.readouterr().err
+    with pytest.raises(Exception, match=re.escape(expected)) as ended:
+        run(**paths, stop=threading.Event(), seconds=0.05)  # type: ignore[arg-type]
+    assert getattr(ended.value, "exit_status", None) == status
 
 
 @pytest.mark.parametrize("world", ["ideal", "default", "harsh"])
@@ -272,8 +275,8 @@ def test_simulate_runs_in_every_world(files: Path, world: str) -> None:
 
 
 def test_gripper_has_no_sheet_behaviour(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = {"seed": 1, "drift": False, "world": "default", "gripper": "tcp://127.0.0.1:*"}
-    assert run_command(files / "hand.toml", sheet="S1", **options) == 2  # type: ignore[arg-type]
+    gripper = ["--gripper", "tcp://127.0.0.1:*"]
+    assert main(["simulate", str(files / "hand.toml"), "--sheet", "S1", *gripper]) == 2
     assert "--gripper excludes --sheet" in capsys.readouterr().err
 
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import Deployment, parse
+from handtouch.core.pad_model import default_calibration_id_of
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
-from handtouch.supervisor.ipc import SampleBlock, WorkerConfig, pack_serials
+from handtouch.supervisor.ipc import NodeSerials, SampleBlock
 from tests.deployments import deployment_text, pad_text
 
 NOW = datetime(2026, 3, 1, tzinfo=UTC)
@@ -27,21 +26,20 @@ LENGTHS = (20.0, 41.0, 80.0)
 
 @dataclass(frozen=True)
 class Bench:
-    """A deployment, the worker configuration, and the actual gains of the channels."""
+    """A deployment, ids of its calibrations by link, and the actual gains of the channels."""
 
     deployment: Deployment
-    start: WorkerConfig
+    ids: dict[str, str]
     gains: NDArray[np.float64]
 
-    def introduce(self, now: list[int | None], before: list[int | None] | None = None) -> dict[str, Any]:
-        message: dict[str, Any] = msgpack.unpackb(pack_serials(now, before or [None] * 3, 0))
-        return message
+    def introduce(self, now: list[int | None], before: list[int | None] | None = None) -> NodeSerials:
+        return NodeSerials(now=tuple(now), before=tuple(before or [None] * 3), sync_ns=0)
 
-    def block(self, counts: NDArray[np.float64], contact: NDArray[np.uint32], t_ns: int) -> dict[str, Any]:
+    def block(self, counts: NDArray[np.float64], contact: NDArray[np.uint32], t_ns: int) -> SampleBlock:
         """Return a message of the daemon with counts (k, 3, 4) and contact identifiers (k, 3)."""
         k = len(counts)
         times = t_ns + PERIOD_NS * np.arange(k, dtype=np.int64)
-        block = SampleBlock(
+        return SampleBlock(
             times,
             np.repeat(times[:, None], 3, axis=1),
             np.rint(counts).astype(np.int64),
@@ -54,22 +52,18 @@ class Bench:
             np.full(3, np.nan),
             np.full(3, np.nan),
         )
-        message: dict[str, Any] = msgpack.unpackb(block.dump())
-        return message
 
 
 @pytest.fixture(scope="session")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+def bench() -> Bench:
     pads = [
         pad_text(link, number, f'{{ kind = "plane", length_mm = {length}, width_mm = 20.0 }}')
         for number, (link, length) in enumerate(zip(LINKS, LENGTHS, strict=True), 1)
     ]
     deployment = parse(deployment_text(*pads, touch=""))
-    scale = np.full((3, 4), 10e-3 / 32767)
-    store = str(tmp_path_factory.mktemp("store") / "calibrations.db")
-    start = WorkerConfig(deployment, store, tuple(f"nominal-{link}" for link in LINKS), scale, np.ones(3))
+    ids = {pad.link: default_calibration_id_of(pad, deployment) for _, pad in deployment.pads}
     logs = np.random.default_rng(2).normal(0, 0.03, (3, 4))
-    return Bench(deployment, start, np.exp(logs - logs.mean(axis=1, keepdims=True)))
+    return Bench(deployment, ids, np.exp(logs - logs.mean(axis=1, keepdims=True)))
 
 
 @pytest.fixture(scope="session")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,10 +49,10 @@ force_n = [1.5]
 )
 
 
-def block(counts: NDArray[np.int64], since: int) -> dict[str, Any]:
+def block(counts: NDArray[np.int64], since: int) -> SampleBlock:
     k = len(counts)
     times = 10**9 + PERIOD_NS * np.arange(since, since + k, dtype=np.int64)
-    made = SampleBlock(
+    return SampleBlock(
         times,
         np.repeat(times[:, None], 3, axis=1),
         counts.astype(np.int64),
@@ -67,8 +65,6 @@ def block(counts: NDArray[np.int64], since: int) -> dict[str, Any]:
         np.full(3, np.nan),
         np.full(3, np.nan),
     )
-    message: dict[str, Any] = msgpack.unpackb(made.dump())
-    return message
 
 
 def test_gum_is_diagnosed_with_position_size_and_begin(bench: Bench, tmp_path: Path) -> None:
@@ -76,7 +72,7 @@ def test_gum_is_diagnosed_with_position_size_and_begin(bench: Bench, tmp_path: P
         bench.deployment, Scenario.parse(SCENARIO), WORLDS["default"].only("parts", "contacts").draw(8)
     )
     worker = SupervisorWorker(
-        bench.start, StoreClient(tmp_path / "c.db"), DeploymentDiagnostics(bench.deployment)
+        bench.deployment, StoreClient(tmp_path / "c.db"), DeploymentDiagnostics(bench.deployment)
     )
     messages = worker.process_message(bench.introduce([1, 2, 3]), NOW)
     ticks = round(SECONDS * 1e9 / PERIOD_NS)

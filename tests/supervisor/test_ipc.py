@@ -14,12 +14,13 @@ from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
-    WorkerConfig,
+    NodeSerials,
+    SampleBlock,
     WorkerMessage,
     WorkerMessageError,
     WorkerStatus,
-    pack_worker_message,
-    unpack_block,
+    pack_message,
+    unpack_daemon_message,
     unpack_worker_message,
 )
 from handtouch.wire.diagnosis import Diagnosis
@@ -47,7 +48,7 @@ MESSAGES: list[WorkerMessage] = [
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.kind)
 def test_message_round_trips(message: WorkerMessage) -> None:
-    assert unpack_worker_message(pack_worker_message(message)) == message
+    assert unpack_worker_message(pack_message(message)) == message
 
 
 @given(st.binary(max_size=200))
@@ -80,7 +81,7 @@ def test_other_bytes_are_refused(data: bytes) -> None:
 def test_message_with_any_other_value_is_valid_or_refused(
     message: WorkerMessage, key: str, value: Any
 ) -> None:
-    record = json.loads(pack_worker_message(message))
+    record = json.loads(pack_message(message))
     record[key] = value
     try:
         made = unpack_worker_message(json.dumps(record).encode())
@@ -91,14 +92,13 @@ def test_message_with_any_other_value_is_valid_or_refused(
         assert 0.1 <= gain <= 10
 
 
-def test_configuration_and_block_round_trip(bench: Bench) -> None:
-    again = WorkerConfig.load(bench.start.dump())
-    assert again.deployment == bench.deployment
-    assert again.default_calibration_ids == bench.start.default_calibration_ids
-    assert (again.ampere_per_count == bench.start.ampere_per_count).all()
+def test_messages_of_the_daemon_round_trip(bench: Bench) -> None:
+    serials = NodeSerials(now=(1, None), before=(None, 2), sync_ns=5)
+    assert unpack_daemon_message(pack_message(serials)) == serials
     counts = np.arange(60.0).reshape(5, 3, 4)
     contact = np.arange(15, dtype=np.uint32).reshape(5, 3)
-    block = unpack_block(bench.block(counts, contact, 100), 3)
+    block = unpack_daemon_message(bench.block(counts, contact, 100).dump())
+    assert isinstance(block, SampleBlock)
     assert (block.counts == counts).all()
     assert (block.contact_id == contact).all()
     assert np.isnan(block.back_n).all()

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -29,21 +30,21 @@ from handtouch.sheet import S1, BankPrior, BankState, ModelBank
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
+    ManualCalibration,
     WorkerMessage,
     WorkerStatus,
-    pack_manual_calibration,
 )
 from handtouch.supervisor.worker import SupervisorWorker
 
 from .conftest import LINKS, NOW, PERIOD_NS, Bench
 
-MOUNTING_POINT = MountingPoint("h", LINKS[0], f"nominal-{LINKS[0]}")
+MOUNTING_POINT = MountingPoint("h", LINKS[0], "tables")
 Session = list[Any]
 Swapped = tuple[list[WorkerMessage], Path]
 
 
 def make_worker(bench: Bench, path: Path) -> SupervisorWorker:
-    return SupervisorWorker(bench.start, StoreClient(path))
+    return SupervisorWorker(bench.deployment, StoreClient(path))
 
 
 def play(worker: SupervisorWorker, bench: Bench, session: Session, since: int = 0) -> list[WorkerMessage]:
@@ -108,7 +109,7 @@ def test_contacts_calibrate_a_replaced_node(bench: Bench, swapped: Swapped) -> N
     assert (stored.provenance.hand, stored.provenance.link, stored.config) == (
         "h",
         "square",
-        "nominal-square",
+        bench.ids["square"],
     )
 
 
@@ -189,7 +190,7 @@ def test_manual_gains_end_quarantine_and_are_refined(bench: Bench, session: Sess
     worker.process_message(bench.introduce([11, 12, 13], [1, 2, 3]), NOW)
     gains, wide = (1.5, 1.0, 1.0, 1.0), tuple((1e-4 * (np.eye(4) - 0.25)).ravel().tolist())
     message = CalibrationUpdate(pad=2, serial=13, calibration_id="bench.1", gains=gains, covariance=wide)
-    messages = worker.process_message(msgpack.unpackb(pack_manual_calibration(message, ["gains"])), NOW)
+    messages = worker.process_message(ManualCalibration(given=("gains",), update=message), NOW)
     assert calibrations(messages, 2) == [message]  # sent again, as a stored version may have replaced it
     assert (assessment(messages, 2).calibration_state, assessment(messages, 2).diagnoses) == (
         "calibrated",
@@ -199,12 +200,12 @@ def test_manual_gains_end_quarantine_and_are_refined(bench: Bench, session: Sess
     near = CalibrationUpdate(
         pad=0, serial=11, calibration_id="bench", gains=tuple(1.1 * bench.gains[0]), covariance=wide
     )
-    worker.process_message(msgpack.unpackb(pack_manual_calibration(near, ["gains"])), NOW)
+    worker.process_message(ManualCalibration(given=("gains",), update=near), NOW)
     last = calibrations(play(worker, bench, session), 0)[-1]
     assert np.log(last.gains) == pytest.approx(np.log(near.gains), abs=0.01)  # with their common factor
     assert (
         worker.process_message(
-            msgpack.unpackb(pack_manual_calibration(near.model_copy(update={"serial": 99}), ["gains"])), NOW
+            ManualCalibration(given=("gains",), update=near.model_copy(update={"serial": 99})), NOW
         )
         == []
     )
@@ -217,7 +218,7 @@ def test_gains_out_of_range_are_reported_and_never_applied(
     worker.process_message(bench.introduce([11, 12, 13]), NOW)
     wide = tuple((1e-2 * (np.eye(4) - 0.25)).ravel().tolist())
     manual = CalibrationUpdate(pad=0, serial=11, calibration_id="bench", gains=(9.9,) * 4, covariance=wide)
-    worker.process_message(msgpack.unpackb(pack_manual_calibration(manual, ["gains"])), NOW)
+    worker.process_message(ManualCalibration(given=("gains",), update=manual), NOW)
     messages = play(worker, bench, session)
     assert all(max(message.gains) <= 10 for message in calibrations(messages, 0))
     in_quarantine = [
@@ -236,7 +237,7 @@ def test_measured_law_ends_quarantine_of_a_pad_without_observable_gains(bench: B
     )
     law = LawParameters(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
     with Store(tmp_path / "c.db") as store:
-        store.write(13, "nominal-strip", Calibration(law=law), Provenance("guided session"), NOW)
+        store.write(13, bench.ids["strip"], Calibration(law=law), Provenance("guided session"), NOW)
     messages = later(bench, worker, 3.0)
     (applied,) = calibrations(messages, 2)
     assert applied.law is not None
@@ -251,7 +252,7 @@ def test_a_stored_calibration_without_gains_leaves_their_stated_tolerances(
     """Gains as in the deployment file are no exact ones."""
     offsets = Offsets((1.0,) * 4, (0.1,) * 4)
     with Store(tmp_path / "c.db") as store:
-        store.write(11, "nominal-square", Calibration(offsets=offsets), Provenance("offsets"), NOW)
+        store.write(11, bench.ids["square"], Calibration(offsets=offsets), Provenance("offsets"), NOW)
     messages = make_worker(bench, tmp_path / "c.db").process_message(
         bench.introduce([11, 12, 13], [None, None, None]), NOW
     )
@@ -266,7 +267,7 @@ def test_calibration_taken_over_from_another_node_is_applied_and_reported(
     gains = Gains((1.1, 1.0, 1.0, 1.0), matrix(1e-6 * np.eye(4)))
     taken = Provenance("gains from contacts", foreign="it was made for serial 9, not for 11")
     with Store(tmp_path / "c.db") as store:
-        store.write(11, "nominal-square", Calibration(gains), taken, NOW)
+        store.write(11, bench.ids["square"], Calibration(gains), taken, NOW)
     worker = make_worker(bench, tmp_path / "c.db")
     messages = worker.process_message(bench.introduce([11, 12, 13], [1, None, None]), NOW)
     (applied,) = calibrations(messages, 0)
@@ -311,12 +312,12 @@ def test_gain_step_puts_a_node_into_quarantine_until_recalibrated(
 def test_damaged_store_is_reported_moved_aside_and_replaced(bench: Bench, tmp_path: Path) -> None:
     path = tmp_path / "c.db"
     with Store(path) as store:
-        store.write(11, "nominal-square", Calibration(), Provenance("by hand"), NOW)
+        store.write(11, bench.ids["square"], Calibration(), Provenance("by hand"), NOW)
     data = bytearray(path.read_bytes())
     data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
     path.write_bytes(data)
     client = StoreClient(path)
-    worker = SupervisorWorker(bench.start, client)
+    worker = SupervisorWorker(bench.deployment, client)
     messages = worker.process_message(bench.introduce([11, 2, 3]), NOW)
     assert "is damaged" in client.error
     assert any("store" in diagnosis.kind for diagnosis in assessment(messages, 0).diagnoses)
@@ -381,9 +382,9 @@ def store_sheet_state(bench: Bench, path: Path, back_n: float) -> None:
     worker = make_worker(bench, path)
     worker.process_message(bench.introduce([11, 12, 13]), NOW)
     block = bench.block(np.zeros((5, 3, 4)), np.zeros((5, 3), np.uint32), 100)
-    block |= {"back_n": np.array([back_n, np.nan, np.nan]).tobytes(), "back_std_n": np.full(3, 0.1).tobytes()}
-    block |= {"learned_pad": np.int32(0).tobytes(), "learned": learned_behaviour().tobytes()}
-    worker.process_message(block, NOW)
+    sheet = {"back_n": np.array([back_n, np.nan, np.nan]), "back_std_n": np.full(3, 0.1)}
+    learned = {"learned_pad": np.array(0, np.int32), "learned": learned_behaviour()}
+    worker.process_message(replace(block, **sheet, **learned), NOW)
     worker.finish(NOW)
 
 
@@ -412,7 +413,7 @@ def test_sheet_state_of_another_version_restores_what_is_known_of_it(
     state = StoredSheetState("back force", version, msgpack.packb(numbers))
     with Store(tmp_path / "c.db") as store:
         origin = Provenance("baseline and sheet state tracked", hand="h", link=LINKS[0])
-        store.write(11, MOUNTING_POINT.config, Calibration(sheet=state), origin, NOW)
+        store.write(11, bench.ids[LINKS[0]], Calibration(sheet=state), origin, NOW)
     messages = make_worker(bench, tmp_path / "c.db").process_message(bench.introduce([11, 12, 13]), NOW)
     (update,) = calibrations(messages, 0)
     assert (update.back_n, update.learned) == (0.4 if restored else None, ())

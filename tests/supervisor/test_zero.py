@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import timedelta
 from pathlib import Path
 
-import msgpack
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ def diagnosed(bench: Bench, path: Path, load: Counts, baseline: Counts, age_h: f
 
     baseline: the daemon's, (4,). age_h: of the stored calibrations.
     """
-    worker = SupervisorWorker(bench.start, StoreClient(path), DeploymentDiagnostics(bench.deployment))
+    worker = SupervisorWorker(bench.deployment, StoreClient(path), DeploymentDiagnostics(bench.deployment))
     now = NOW + timedelta(hours=age_h)
     messages = worker.process_message(bench.introduce([11, 2, 3], [1, 2, 3]), now)
     rng = np.random.default_rng(5)
@@ -52,7 +51,7 @@ def diagnosed(bench: Bench, path: Path, load: Counts, baseline: Counts, age_h: f
             np.ones((TOGETHER, 3), np.bool_), np.zeros((TOGETHER, 3), np.uint8),
             np.zeros((TOGETHER, 3), np.uint32), offsets, np.full(3, 0.5), np.ones((3, 4)), empty, empty,
         )  # fmt: skip
-        messages += worker.process_message(msgpack.unpackb(block.dump()), now)
+        messages += worker.process_message(block, now)
     worker.finish(now)
     return {
         diagnosis.kind.value
@@ -62,12 +61,12 @@ def diagnosed(bench: Bench, path: Path, load: Counts, baseline: Counts, age_h: f
     } - {"node_replaced"}
 
 
-def store_zero(path: Path) -> None:
+def store_zero(bench: Bench, path: Path) -> None:
     """Store offsets of zero of the node at the first pad."""
     offsets = Offsets((0.0,) * 4, (0.01,) * 4, (1.0,) * 4)
     with Store(path) as store:
         origin = Provenance("baseline and sheet state tracked", hand="h", link=LINKS[0])
-        store.write(11, f"nominal-{LINKS[0]}", Calibration(offsets=offsets), origin, NOW)
+        store.write(11, bench.ids[LINKS[0]], Calibration(offsets=offsets), origin, NOW)
 
 
 def test_zeros_of_a_replaced_node_are_no_load(bench: Bench, tmp_path: Path) -> None:
@@ -75,14 +74,14 @@ def test_zeros_of_a_replaced_node_are_no_load(bench: Bench, tmp_path: Path) -> N
 
 
 def test_zeros_that_drifted_since_they_were_stored_are_no_load(bench: Bench, tmp_path: Path) -> None:
-    store_zero(tmp_path / "c.db")
+    store_zero(bench, tmp_path / "c.db")
     assert diagnosed(bench, tmp_path / "c.db", DRIFTED, DRIFTED, age_h=2.0) == set()
 
 
 @pytest.mark.parametrize("tracked", [False, True])
 def test_gum_is_found_though_a_baseline_has_tracked_it(bench: Bench, tmp_path: Path, tracked: bool) -> None:
     gum = fractions(0.3, 0.6) * 120
-    store_zero(tmp_path / "c.db")
+    store_zero(bench, tmp_path / "c.db")
     found = diagnosed(bench, tmp_path / "c.db", gum, gum if tracked else np.zeros(4), age_h=2.0)
     assert found == {"gum"}
 

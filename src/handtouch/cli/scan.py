@@ -94,13 +94,6 @@ def run(
         listen_s=seconds or (5.0 if listen else 1.0),
         lss_wait_s=lss_wait_ms * 1e-3,
     )
-    return run_scan(config_path, buses, request, as_json=as_json)
-
-
-def run_scan(
-    config_path: Path | None, buses: Sequence[str], request: ScanRequest, *, as_json: bool = False
-) -> int:
-    """Run a scan as requested, print its result and return the exit status."""
     deployment = None if config_path is None else config.load(config_path)
     with ProgressLine() as progress:
         reports = scan_buses(buses_to_scan(deployment, buses), request, deployment, progress.update)

@@ -14,7 +14,6 @@ from handtouch import config
 from handtouch.calibration.calibration import LawParameters, LearnedParts, matrix
 from handtouch.config import Deployment
 from handtouch.config.channels import (
-    Channels,
     node_channels,
     order_by_electrode,
     shear_numbers,
@@ -113,10 +112,9 @@ class PadModel:
         self._used = np.arange(self.channels) < self.electrode_counts[:, None]
         self.ampere_per_count = np.zeros((self.size, self.channels))
         self.ampere_per_count[self._used] = np.concatenate(
-            [_ampere_per_count(pad, deployment, kinds[pad.node]) for pad in pads]
+            [ampere_per_count_of(pad, deployment) for pad in pads]
         )
-        counts = [math.hypot(node.noise_counts, 1 / math.sqrt(12)) for node in nodes]  # and quantisation
-        self.noise_counts = np.array(counts)
+        self.noise_counts = np.array([noise_counts_of(node) for node in nodes])
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
         self.weight = np.zeros(self.noise_a.shape)
         self.weight[self._used] = 1 / self.noise_a[self._used]
@@ -418,9 +416,18 @@ def _behaviour_of_sheet(sheet: config.Sheet, name: str) -> SheetBehaviour | None
     return sheet_behaviour_of(sheet.behaviour, name) if sheet.behaviour else None
 
 
-def _ampere_per_count(pad: config.Pad, deployment: Deployment, channels: Channels) -> list[float]:
-    """Return the current per count of the electrodes; the sum of all is the mean of those of the states."""
+def noise_counts_of(node: config.Node) -> float:
+    """Return the standard deviation of a channel's counts, quantisation included."""
+    return math.hypot(node.noise_counts, 1 / math.sqrt(12))
+
+
+def ampere_per_count_of(pad: config.Pad, deployment: Deployment) -> list[float]:
+    """Return the current per count of the electrodes, without any calibration.
+
+    The sum of all is the mean of those of the states.
+    """
     node = deployment.nodes[pad.node]
+    channels = node_channels(node)
     scale = [node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names]
     return [
         node.full_scale_ma * 1e-3 / (node.full_scale_counts or channel.limits[1]) * factor / pad.state_count

@@ -319,7 +319,7 @@ class ControlCommands:
         if supervisor is not None:
             supervisor.excitation.set_after(change.deployment.scene.excitation_off_after_s)
             if change.model is not None:
-                supervisor.restart_with(change.deployment, change.model, now_ns)
+                supervisor.restart_with(change.deployment, now_ns)
         if self._reporter.percepts is not None and change.changed_keys_of_pad:
             self._reporter.percepts.restart_with(change.deployment, now_ns)
         self._files = change.files

@@ -26,7 +26,6 @@ from handtouch.core.events import (
     ExcitationEvent,
     ReplacementEvent,
 )
-from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
 from handtouch.daemon.child_process import ChildProcess
@@ -35,12 +34,12 @@ from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
     ContactLawMessage,
-    WorkerConfig,
+    ManualCalibration,
+    NodeSerials,
     WorkerMessage,
     WorkerMessageError,
     WorkerStatus,
-    pack_manual_calibration,
-    pack_serials,
+    pack_message,
     unpack_worker_message,
 )
 from handtouch.wire.diagnosis import Diagnosis
@@ -79,12 +78,12 @@ class SupervisorClient:
         on_excitation_changed: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._pipeline, self._master = pipeline, master
-        self._pads = deployment.pads
         self._store = store
-        self.start_message = self._make_start_message(deployment, pipeline.model)
-        """configuration of the supervisor process when it starts next"""
+        self._set_deployment(deployment)
         self.process = process or ChildProcess(
-            "handtouch.supervisor.child", "supervisor", lambda: self.start_message.dump()
+            "handtouch.supervisor.child",
+            "supervisor",
+            lambda: self.deployment.model_dump_json(by_alias=True).encode(),
         )
         self.assessments: list[CalibrationAssessment | None] = [None] * pipeline.model.size
         self.malformed = self.late = 0
@@ -126,10 +125,9 @@ class SupervisorClient:
         """Start the supervisor process."""
         self.process.start(now_ns)
 
-    def restart_with(self, deployment: Deployment, model: PadModel, now_ns: int) -> None:
-        """Restart the supervisor process with a reloaded deployment and the model made from it."""
-        self._pads = deployment.pads
-        self.start_message = self._make_start_message(deployment, model)
+    def restart_with(self, deployment: Deployment, now_ns: int) -> None:
+        """Restart the supervisor process with a reloaded deployment."""
+        self._set_deployment(deployment)
         self.process.restart(now_ns)
 
     def close(self) -> None:
@@ -250,14 +248,14 @@ class SupervisorClient:
 
     # Details ----------------------------------------------------------------------------------------------
 
-    def _make_start_message(self, deployment: Deployment, model: PadModel) -> WorkerConfig:
-        scale = np.array(model.ampere_per_count / np.where(model.gains > 0, model.gains, 1.0))
-        return WorkerConfig(
-            deployment, self._store, tuple(model.default_calibration_ids), scale, model.noise_counts
-        )
+    def _set_deployment(self, deployment: Deployment) -> None:
+        """Set the deployment, with the path of the store, that the supervisor process gets when it starts."""
+        daemon = deployment.daemon.model_copy(update={"store": self._store})
+        self.deployment, self._pads = deployment.model_copy(update={"daemon": daemon}), deployment.pads
 
     def _send_serials(self, now_ns: int) -> None:
-        self.process.send(pack_serials(self._serials, self._previous_serials, now_ns))
+        serials = NodeSerials(now=tuple(self._serials), before=tuple(self._previous_serials), sync_ns=now_ns)
+        self.process.send(pack_message(serials))
         for pad in self._manual_parts:
             self._send_manual_calibration(pad)
 
@@ -283,7 +281,7 @@ class SupervisorClient:
         )
         if {"gains", "law"} & given:  # the supervisor process confirms these
             self._unconfirmed_calibrations[pad] = message.calibration_id
-        self.process.send(pack_manual_calibration(message, sorted(given)))
+        self.process.send(pack_message(ManualCalibration(given=tuple(sorted(given)), update=message)))
 
     def _quarantine_pad(self, pad: int) -> None:
         """Discard the calibration of a pad whose node was replaced, until the new node is calibrated."""

@@ -13,22 +13,19 @@ from handtouch.host.child import Worker, child_logging, run_child
 
 @contextlib.contextmanager
 def _open_worker(start_message: bytes) -> Iterator[Worker]:
-    import msgpack
-
     from handtouch.calibration.store_client import StoreClient
+    from handtouch.config import Deployment
     from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
-    from handtouch.supervisor.ipc import WorkerConfig, pack_worker_message
+    from handtouch.supervisor.ipc import pack_message, unpack_daemon_message
     from handtouch.supervisor.worker import SupervisorWorker
 
-    start = WorkerConfig.load(start_message)
-    with child_logging(start.deployment.daemon.log_level, "supervisor"):
-        worker = SupervisorWorker(
-            start, StoreClient(Path(start.store)), DeploymentDiagnostics(start.deployment)
-        )
+    deployment = Deployment.model_validate_json(start_message)
+    with child_logging(deployment.daemon.log_level, "supervisor"):
+        store = StoreClient(Path(deployment.daemon.store or ""))
+        worker = SupervisorWorker(deployment, store, DeploymentDiagnostics(deployment))
 
         def process_message(data: bytes) -> Iterable[bytes]:
-            messages = worker.process_message(msgpack.unpackb(data), datetime.now(UTC))
-            return [pack_worker_message(message) for message in messages]
+            return map(pack_message, worker.process_message(unpack_daemon_message(data), datetime.now(UTC)))
 
         try:
             yield process_message

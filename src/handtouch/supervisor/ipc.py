@@ -1,17 +1,15 @@
 """Messages between daemon and supervisor process over their socket pair.
 
-Public: to the supervisor process `WorkerConfig` (JSON on its standard input), `SampleBlock` (ticks of all
-pads), `pack_serials` and `pack_manual_calibration` (set by an operator), as msgpack maps; from it
-`WorkerStatus`, `CalibrationUpdate` and `CalibrationAssessment`, as JSON. `unpack_worker_message` accepts any
-bytes and raises WorkerMessageError.
+To the supervisor process: `SampleBlock` (ticks of all pads), as msgpack, `NodeSerials` and
+`ManualCalibration` (set by an operator); from it `WorkerStatus`, `CalibrationUpdate` and
+`CalibrationAssessment`. All but blocks are JSON. `unpack_worker_message` accepts any bytes and raises
+WorkerMessageError. On its standard input the process gets the deployment.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import msgpack
 import numpy as np
@@ -27,7 +25,7 @@ from handtouch.calibration.calibration import (
     ChannelValues,
     LearnedParts,
 )
-from handtouch.config import Deployment, Table
+from handtouch.config import Table
 from handtouch.sheet import BANK_LEARNED, check_learned
 from handtouch.wire.diagnosis import Diagnosis
 
@@ -46,46 +44,6 @@ PadIndex = Annotated[int, Field(ge=0, le=100_000)]
 
 class WorkerMessageError(ValueError):
     """Bytes that are no message of the supervisor process."""
-
-
-@dataclass(frozen=True)
-class WorkerConfig:
-    """Configuration of the supervisor process; pads in the order of the deployment.
-
-    default_calibration_ids: of the deployment file's own calibrations. ampere_per_count (n, c) without any
-    calibration, c channels of the pad with most, 0 beyond a pad's own; noise_counts (n,). store: path of the
-    calibration store.
-    """
-
-    deployment: Deployment
-    store: str
-    default_calibration_ids: tuple[str, ...]
-    ampere_per_count: FloatArray
-    noise_counts: FloatArray
-
-    def dump(self) -> bytes:
-        """Return the configuration as JSON."""
-        return json.dumps(
-            {
-                "deployment": self.deployment.model_dump(mode="json", by_alias=True),
-                "store": self.store,
-                "default_calibration_ids": self.default_calibration_ids,
-                "ampere_per_count": self.ampere_per_count.tolist(),
-                "noise_counts": self.noise_counts.tolist(),
-            }
-        ).encode()
-
-    @classmethod
-    def load(cls, data: bytes) -> WorkerConfig:
-        """Return the configuration that `dump` made the JSON of."""
-        record = json.loads(data)
-        return cls(
-            Deployment.model_validate(record["deployment"]),
-            record["store"],
-            tuple(record["default_calibration_ids"]),
-            np.array(record["ampere_per_count"]),
-            np.array(record["noise_counts"]),
-        )
 
 
 @dataclass(frozen=True)
@@ -116,43 +74,24 @@ class SampleBlock:
 
     def dump(self) -> bytes:
         """Return the block as msgpack."""
-        parts = {name: np.ascontiguousarray(value).tobytes() for name, value in vars(self).items()}
-        shape = {"ticks": len(self.sync_ns), "channels": self.counts.shape[2]}
-        packed: bytes = msgpack.packb({"kind": "block", **shape, **parts})
+        arrays = {name: np.ascontiguousarray(array) for name, array in vars(self).items()}
+        packed: bytes = msgpack.packb({n: (a.dtype.str, a.shape, a.tobytes()) for n, a in arrays.items()})
         return packed
 
-
-_BLOCK_LAYOUT: dict[str, tuple[str, bool, bool]] = {  # dtype, one element per channel, one row per tick
-    "sample_ns": ("<i8", False, True),
-    "counts": ("<i8", True, True),
-    "fresh": ("?", False, True),
-    "pad_state": ("u1", False, True),
-    "contact_id": ("<u4", False, True),
-    "offset_counts": ("<f8", True, False),
-    "offset_std": ("<f8", False, False),
-    "noise_counts": ("<f8", True, False),
-    "back_n": ("<f8", False, False),
-    "back_std_n": ("<f8", False, False),
-}
+    @classmethod
+    def load(cls, data: bytes) -> SampleBlock:
+        """Return the block that `dump` made the bytes of."""
+        arrays = msgpack.unpackb(data).items()
+        return cls(**{name: np.frombuffer(raw, kind).reshape(shape) for name, (kind, shape, raw) in arrays})
 
 
-def pack_serials(now: Sequence[int | None], before: Sequence[int | None], sync_ns: int) -> bytes:
-    """Return a message with the serial numbers of all pads' nodes, now and before; None if unknown."""
-    message = {"kind": "serials", "serials": list(now), "before": list(before), "sync_ns": sync_ns}
-    packed: bytes = msgpack.packb(message)
-    return packed
+class NodeSerials(Table):
+    """Serial numbers of all pads' nodes, now and before; None if unknown."""
 
-
-def unpack_block(message: dict[str, Any], pads: int) -> SampleBlock:
-    """Return the block in a message of the daemon, which is trusted."""
-    ticks, channels = int(message["ticks"]), int(message["channels"])
-    whole = {"sync_ns": "<i8", "learned_pad": "<i4", "learned": "<f8"}
-    arrays: dict[str, Any] = {name: np.frombuffer(message[name], kind) for name, kind in whole.items()}
-    arrays["learned_pad"] = arrays["learned_pad"].reshape(())
-    for name, (kind, per_channel, per_tick) in _BLOCK_LAYOUT.items():
-        shape = (*((ticks,) if per_tick else ()), pads, *((channels,) if per_channel else ()))
-        arrays[name] = np.frombuffer(message[name], kind).reshape(shape)
-    return SampleBlock(**arrays)
+    kind: Literal["serials"] = "serials"
+    now: tuple[int | None, ...]
+    before: tuple[int | None, ...]
+    sync_ns: int
 
 
 class WorkerStatus(Table):
@@ -237,22 +176,32 @@ class CalibrationAssessment(Table):
     dead_electrode: Annotated[int, Field(ge=0, lt=MAX_CHANNELS)] | None = None
 
 
-def pack_manual_calibration(update: CalibrationUpdate, given: Collection[str]) -> bytes:
-    """Return a message with a calibration that an operator applied, and the names of the given fields."""
-    message = {"kind": "manual_calibration", "given": list(given), "update": update.model_dump_json()}
-    packed: bytes = msgpack.packb(message)
-    return packed
+class ManualCalibration(Table):
+    """A calibration that an operator applied, and the names of the given fields."""
+
+    kind: Literal["manual_calibration"] = "manual_calibration"
+    given: tuple[str, ...]
+    update: CalibrationUpdate
 
 
+DaemonMessage = SampleBlock | NodeSerials | ManualCalibration
+_CONTROL_MESSAGE: TypeAdapter[NodeSerials | ManualCalibration] = TypeAdapter(
+    Annotated[NodeSerials | ManualCalibration, Field(discriminator="kind")]
+)
 WorkerMessage = WorkerStatus | CalibrationUpdate | CalibrationAssessment
 _WORKER_MESSAGE: TypeAdapter[WorkerMessage] = TypeAdapter(
     Annotated[WorkerMessage, Field(discriminator="kind")]
 )
 
 
-def pack_worker_message(message: WorkerMessage) -> bytes:
-    """Return a message of the supervisor process as JSON."""
+def pack_message(message: Table) -> bytes:
+    """Return a message other than a block as JSON."""
     return message.model_dump_json().encode()
+
+
+def unpack_daemon_message(data: bytes) -> DaemonMessage:
+    """Return a message of the daemon, which is trusted. A map of msgpack doesn't begin with a brace."""
+    return _CONTROL_MESSAGE.validate_json(data) if data[:1] == b"{" else SampleBlock.load(data)
 
 
 def unpack_worker_message(data: bytes) -> WorkerMessage:

@@ -30,6 +30,8 @@ from handtouch.calibration.calibration import (
 from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
+from handtouch.config import Deployment
+from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_stds
@@ -39,12 +41,13 @@ from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
     ContactLawMessage,
+    DaemonMessage,
     FloatArray,
+    ManualCalibration,
+    NodeSerials,
     SampleBlock,
-    WorkerConfig,
     WorkerMessage,
     WorkerStatus,
-    unpack_block,
 )
 from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
@@ -110,44 +113,45 @@ class SupervisorWorker:
     """
 
     def __init__(
-        self, start: WorkerConfig, store: StoreClient, diagnostics: Diagnostics | None = None
+        self, deployment: Deployment, store: StoreClient, diagnostics: Diagnostics | None = None
     ) -> None:
-        deployment = start.deployment
         entries = deployment.pads
         models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
         self._pads = []
-        noise = start.noise_counts[:, None] * start.ampere_per_count
+        most = max(len(pad.electrode_names) for _, pad in entries)
+        self._ampere_per_count = np.zeros((len(entries), most))
+        """(n, c) without any calibration, 0 beyond a pad's own channels"""
         for number, (hand, pad) in enumerate(entries):
             design, sheet = (network_parameters(pad), pad.sheet, pad.node), deployment.sheets[pad.sheet]
+            node, scale = deployment.nodes[pad.node], np.array(ampere_per_count_of(pad, deployment))
+            self._ampere_per_count[number, : len(scale)] = scale
             if design not in models:
-                network, node = pad_network(pad, sheet), deployment.nodes[pad.node]
+                network = pad_network(pad, sheet)
                 others = models_with_other_parts(network, pad, node, sheet)
                 models[design] = network, others, part_stds(pad, node, sheet)
-            mounting_point = MountingPoint(hand, pad.link, start.default_calibration_ids[number])
-            channels = len(pad.electrode_names)
-            detector = StationaryContactDetector(noise[number, :channels])
+            mounting_point = MountingPoint(hand, pad.link, default_calibration_id_of(pad, deployment))
+            detector = StationaryContactDetector(noise_counts_of(node) * scale)
             calibrator = AutoCalibrator(*models[design])
             self._pads.append(
-                _PadEntry(mounting_point, calibrator, detector, channels, bool(pad.switch_states))
+                _PadEntry(mounting_point, calibrator, detector, len(scale), bool(pad.switch_states))
             )
-        self._ampere_per_count = start.ampere_per_count
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])
         self._diagnoses: dict[int, list[Diagnosis]] = {}
         self._dead_electrodes: Mapping[int, int] = {}
         self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
 
-    def process_message(self, message: dict[str, Any], now: datetime) -> list[WorkerMessage]:
+    def process_message(self, message: DaemonMessage, now: datetime) -> list[WorkerMessage]:
         """Process a message of the daemon; return the messages that follow."""
         messages: list[WorkerMessage] = []
-        if message["kind"] == "serials":
-            self._latest_sync_ns = max(self._latest_sync_ns, message["sync_ns"])
-            self._assign_nodes(message["serials"], message["before"], now, messages)
-        elif message["kind"] == "block":
-            self._process_block(unpack_block(message, len(self._pads)), now, messages)
-        elif message["kind"] == "manual_calibration":
-            update = CalibrationUpdate.model_validate_json(message["update"])
-            self._apply_manual_calibration(update, message["given"], messages)
+        match message:
+            case NodeSerials():
+                self._latest_sync_ns = max(self._latest_sync_ns, message.sync_ns)
+                self._assign_nodes(message.now, message.before, now, messages)
+            case SampleBlock():
+                self._process_block(message, now, messages)
+            case ManualCalibration():
+                self._apply_manual_calibration(message.update, message.given, messages)
         self._poll_store(now, messages)
         for pad in range(len(self._pads)):
             self._report_assessment(pad, messages)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config.channels import node_channels, order_by_electrode
+from handtouch.core.pad_model import ampere_per_count_of
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -104,12 +105,9 @@ class DiagnosisModel:
         scale, limits = np.zeros((len(pads), most)), np.zeros((len(pads), most, 2))
         limits[:] = -np.inf, np.inf
         for row, (pad, node) in enumerate(zip(pads, nodes, strict=True)):
-            channels = order_by_electrode(node_channels(node), pad)
-            for k, (name, channel) in enumerate(zip(pad.electrode_names, channels, strict=True)):
-                full = node.full_scale_counts or channel.limits[1]
-                factor = node.channel_scale[pad.electrodes.index(name)]
-                scale[row, k] = node.full_scale_ma * 1e-3 / full * factor
-                limits[row, k] = channel.saturation
+            own = slice(len(pad.electrode_names))
+            scale[row, own] = ampere_per_count_of(pad, deployment)
+            limits[row, own] = [one.saturation for one in order_by_electrode(node_channels(node), pad)]
         by_design: dict[Hashable, ElectrodeNetwork] = {}  # pads of one design share one network
         networks, designs = [], []
         for pad, node in zip(pads, nodes, strict=True):
