@@ -74,8 +74,8 @@ class SampleBlock:
 
     def dump(self) -> bytes:
         """Return the block as msgpack."""
-        arrays = {name: np.ascontiguousarray(array) for name, array in vars(self).items()}
-        packed: bytes = msgpack.packb({n: (a.dtype.str, a.shape, a.tobytes()) for n, a in arrays.items()})
+        arrays = {name: (a.dtype.str, a.shape, a.tobytes()) for name, a in vars(self).items()}
+        packed: bytes = msgpack.packb(arrays)
         return packed
 
     @classmethod
