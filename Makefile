@@ -99,7 +99,7 @@ docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are error
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
 tables: $(VENV)/.dev ## write docs/configuration.md, docs/wire.schema.json and the tables of wire.md and firmware.md from the code
-	$(BIN)/python -m handtouch.wire.tables docs
+	$(BIN)/python docs/wire_tables.py
 	$(BIN)/python docs/firmware_tables.py
 	@mkdir -p build
 	$(BIN)/python docs/configuration_page.py >build/configuration.md && mv build/configuration.md docs/configuration.md

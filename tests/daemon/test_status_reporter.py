@@ -16,7 +16,7 @@ from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent, Se
 from handtouch.config import Behaviour
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.status_reporter import StatusReporter
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 from tests.sheet.test_bank import Pads
 
 PERIOD_NS = 5_000_000

@@ -28,8 +28,8 @@ from handtouch.supervisor.ipc import (
     unpack_daemon_message,
 )
 from handtouch.wire import PadState
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 PERIOD_NS = 5_000_000
 SECOND_NS = 1_000_000_000

@@ -39,8 +39,8 @@ from handtouch.supervisor.ipc import (
     pack_message,
 )
 from handtouch.wire import PadState
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 from .conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand, RecordingSession
 

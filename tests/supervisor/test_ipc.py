@@ -23,8 +23,8 @@ from handtouch.supervisor.ipc import (
     unpack_daemon_message,
     unpack_worker_message,
 )
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 from .conftest import Bench
 

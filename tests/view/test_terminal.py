@@ -13,7 +13,7 @@ from handtouch.cli import status
 from handtouch.view.displays import LineDisplay
 from handtouch.view.message_lines import diagnosis_text, message_line, position_std_m
 from handtouch.view.terminal import HandView
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 
 CONTACT = wire.Contact(
     v=1,

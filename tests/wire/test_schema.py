@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from docs.wire_tables import with_tables
 from handtouch import wire
 from handtouch.config.tables import Output
 from handtouch.wire import inputs
 from handtouch.wire.declarations import FieldDeclaration, declared_fields
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 from handtouch.wire.schema import json_schema
-from handtouch.wire.tables import with_tables
 from tests.wire.schema_check import SchemaCheck
 
 DOCS = Path(__file__).parents[2] / "docs"
-UPDATE = "the declarations have changed: run `python -m handtouch.wire.tables docs`"
+UPDATE = "the declarations have changed: run `make tables`"
 ENVELOPE = {"v", "session", "seq", "t_ns", "retained"}
 
 

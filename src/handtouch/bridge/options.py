@@ -1,7 +1,6 @@
 """Options of the bridge, and the daemons that they name.
 
-Public names: `BridgeOptions`, `BridgedDaemon`, `BridgeError`, `bridged_daemons`, `connect_endpoint`,
-`is_key_part`.
+Public names: `BridgeOptions`, `BridgedDaemon`, `BridgeError`, `bridged_daemons`, `is_key_part`.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ class BridgeOptions:
 
 
 def bridged_daemons(options: BridgeOptions) -> list[BridgedDaemon]:
-    """Return the daemons named by the options. Raises BridgeError, ConfigError."""
+    """Return the daemons named by the options. Raises BridgeError, ConfigError, ValueError."""
     daemons = [_daemon_of_config(path) for path in options.configs]
     for text in options.endpoints:
         name, equals, endpoint = text.partition("=")
@@ -83,16 +82,4 @@ def _daemon_of_config(path: Path) -> BridgedDaemon:
         raise BridgeError(
             f"{path}: the file's name can't be one on the network; use --endpoint NAME=ENDPOINT"
         )
-    return BridgedDaemon(
-        name, connect_endpoint(path, settings.complete), connect_endpoint(path, settings.control)
-    )
-
-
-def connect_endpoint(path: Path, endpoint: str) -> str:
-    """Return the endpoint to connect to, of one that a daemon on this machine binds.
-
-    Raises BridgeError for a free port.
-    """
-    if endpoint.endswith(":*"):
-        raise BridgeError(f"{path}: {endpoint} is any free port; give it a number, or use --endpoint")
-    return to_connect(endpoint)
+    return BridgedDaemon(name, to_connect(settings.complete), to_connect(settings.control))

@@ -30,7 +30,7 @@ _POLL_S = 0.2
 def run_bridge(options: BridgeOptions, stop: threading.Event) -> None:
     """Forward topics until `stop`.
 
-    Raises BridgeError, ConfigError, and PermissionError if daemons reject the key.
+    Raises ValueError for wrong options or files, PermissionError if daemons reject the key.
     """
     with ExitStack() as opened:
         threads = [_RelayThread(relay, stop) for relay in _open_relays(options, opened)]
@@ -57,10 +57,7 @@ def _open_relays(options: BridgeOptions, opened: ExitStack) -> Iterator[Relay]:
     for daemon in daemons:
         root = f"{options.prefix}/{daemon.name}"
         made = relay.Relay(session, root)
-        try:
-            made.open(daemon.stream, options.topics or DEFAULT_TOPICS, options.key)
-        except ValueError as error:
-            raise BridgeError(str(error)) from error
+        made.open(daemon.stream, options.topics or DEFAULT_TOPICS, options.key)
         opened.callback(made.close)
         if options.control and daemon.control is not None:
             control = relay.ControlRelay(session, root, daemon.control, options.key)

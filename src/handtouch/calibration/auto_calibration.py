@@ -31,8 +31,8 @@ from handtouch.calibration.gains import (
 )
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.field.model import ForwardModel, FractionModel
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 FloatArray = NDArray[np.float64]
 _INITIAL_LOG_GAIN_STDS = (0.05, 0.2)

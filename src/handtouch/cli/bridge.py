@@ -111,6 +111,6 @@ def _run(relay: Callable[[threading.Event], None]) -> int:
     from handtouch.host.signals import stop_on_signals
 
     stop = stop_on_signals()
-    with contextlib.closing(logs.start_logging()), failing(1, PermissionError):
+    with contextlib.closing(logs.start_logging()), failing(1, PermissionError), failing(2, ValueError):
         relay(stop)
     return 0

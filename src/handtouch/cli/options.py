@@ -165,10 +165,7 @@ def find_endpoint(kind: str, endpoint: str | None = None, config: Path | None = 
         return endpoint or ENDPOINTS[kind][0]
     from handtouch.config import load  # only here, so that commands start quickly
 
-    bound: str = getattr(load(Path(file)).daemon, kind)
-    if bound.endswith(":*"):
-        raise ValueError(f"{file}: {kind} = {bound!r} is any free port; give --endpoint")
-    return to_connect(bound)
+    return to_connect(getattr(load(Path(file)).daemon, kind))
 
 
 def add_key(parser: argparse.ArgumentParser) -> None:

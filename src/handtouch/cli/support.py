@@ -155,8 +155,8 @@ class _Source:
         return json.dumps({"deployment": self._problem or "valid", "checks": checks}, indent=2)
 
     def _status(self) -> str:
-        endpoint = to_connect(self._deployment.daemon.control) if self._deployment else CONTROL_ENDPOINT
         try:
+            endpoint = to_connect(self._deployment.daemon.control) if self._deployment else CONTROL_ENDPOINT
             return json.dumps(request("status", endpoint=endpoint, key=self._key), indent=2)
         except (OSError, RuntimeError, ValueError) as error:
             raise _MissingError(str(error)) from error
@@ -179,11 +179,13 @@ class _Source:
 
     def _recording(self) -> bytes:
         """Record without attaching the deployment's file, whose comments the messages don't have."""
-        endpoint = to_connect(self._deployment.daemon.complete) if self._deployment else COMPLETE_ENDPOINT
+        endpoint = COMPLETE_ENDPOINT
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "recording.mcap"
-            options = RecordOptions(out=path, endpoint=endpoint, key=self._key, seconds=self._seconds)
             try:
+                if self._deployment is not None:
+                    endpoint = to_connect(self._deployment.daemon.complete)
+                options = RecordOptions(out=path, endpoint=endpoint, key=self._key, seconds=self._seconds)
                 with Capture.open(options) as capture:
                     capture.run(threading.Event())
             except (OSError, ValueError) as error:

@@ -39,6 +39,7 @@ from handtouch.hand import (
     pad_network,
     pad_surface,
 )
+from handtouch.hand.pads import sheet_law
 
 FloatArray = NDArray[np.float64]
 _NODE_TOLERANCES = {"gain_std", "series_std"}
@@ -473,14 +474,7 @@ def law_of(sheet: config.Sheet) -> LawParameters:
 
 def contact_law(sheet: config.Sheet, law: LawParameters) -> ContactLaw:
     """Return a law in SI units, with the contact radius of the deployment's sheet."""
-    return ContactLaw(
-        law.contact_ohm_mm2 * 1e-6,
-        law.alpha,
-        sheet.contact_radius_mm * 1e-3,
-        sheet.contact_radius_std_mm * 1e-3,
-        sheet.reference_kpa * 1e3,
-        law.hertz_force_n,
-    )
+    return sheet_law(sheet, law.contact_ohm_mm2, law.alpha, law.hertz_force_n)
 
 
 def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:

@@ -1,6 +1,6 @@
 """A child process of the daemon: a helper thread starts it, the hot thread exchanges messages with it.
 
-Public name: `ChildProcess`.
+Public names: `ChildProcess`, `process_statistics`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from handtouch.host.child import MAX_CHILD_MESSAGE_BYTES
 
@@ -252,6 +253,18 @@ class ChildProcess:
         self.restarts += 1
         self._next_start_ns = now_ns + self._restart_delay_ns
         self._restart_delay_ns = min(2 * self._restart_delay_ns, _MAX_RESTART_DELAY_NS)
+
+
+def process_statistics(process: ChildProcess, sent_ns: int, processed_ns: int | None) -> dict[str, Any]:
+    """Return the state of a process for the `service` message.
+
+    sent_ns: time of the last message sent; processed_ns: up to which the process has processed, None if
+    unknown.
+    """
+    return {
+        **{name: getattr(process, name) for name in ("state", "pid", "restarts", "exit_reason", "dropped")},
+        "lag_s": None if processed_ns is None else max(0, sent_ns - processed_ns) * 1e-9,
+    }
 
 
 def _wait_or_kill(process: subprocess.Popen[bytes]) -> None:

@@ -64,9 +64,8 @@ class MetricsExporter:
 
     def send(self, message: wire.Health | wire.Service) -> None:
         """Pass a message to the server process."""
-        topic, payload = wire.encode(message)
         try:
-            self._parent_socket.send(topic + b"\0" + payload)
+            self._parent_socket.send(wire.to_datagram(message))
         except OSError:
             self.dropped += 1
 

@@ -31,10 +31,9 @@ class _LatestMessages:
         self._lock = threading.Lock()
 
     def store(self, packet: bytes, now_s: float) -> None:
-        topic, _, payload = packet.partition(b"\0")
-        message = wire.decode([topic, payload])
+        message = wire.from_datagram(packet)
         with self._lock:
-            self._messages[topic.decode()] = message
+            self._messages[wire.topic_of(message)] = message
             if isinstance(message, wire.Service):
                 self._service_arrival_s = now_s
 

@@ -21,7 +21,7 @@ from handtouch.core.scene import RequestedOutputs
 from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.tick import TickResult
-from handtouch.daemon.child_process import ChildProcess
+from handtouch.daemon.child_process import ChildProcess, process_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
 from handtouch.wire import PERCEPT_KINDS, ForceStatus, PositionStatus
 
@@ -123,16 +123,9 @@ class PerceptClient:
 
     def statistics(self) -> dict[str, Any]:
         """Return the state of the process for the `service` message."""
-        process, status = self.process, self._status
-        return {
-            "state": process.state,
-            "pid": process.pid,
-            "restarts": process.restarts,
-            "exit_reason": process.exit_reason,
-            "lag_s": max(self._last_sent_sync_ns - status.processed_ns, 0) * 1e-9 if status else None,
-            "dropped": process.dropped,
-            "malformed": self.malformed,
-        }
+        processed_ns = self._status.processed_ns if self._status else None
+        statistics = process_statistics(self.process, self._last_sent_sync_ns, processed_ns)
+        return {**statistics, "malformed": self.malformed}
 
     def close(self) -> None:
         """Stop the process."""

@@ -5,11 +5,10 @@ Public names: `SamplingController`.
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.config import Deployment
@@ -19,12 +18,6 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.wire import PadState
 
 _IDLE_CHECK_PERIOD_NS = 100_000_000  # wake-up is checked at every tick
-
-
-class SyncPeriodSetter(Protocol):
-    """Sets the period of SYNC: `canbus.bus.sync.Sync`."""
-
-    def set_period(self, period_ns: int, now_ns: int) -> None: ...
 
 
 class SamplingController:
@@ -41,7 +34,7 @@ class SamplingController:
         needed: NDArray[np.bool_],
         pipeline: Pipeline,
         master: Master,
-        sync: SyncPeriodSetter,
+        sync: Sync,
     ) -> None:
         pads = [entry.pad for entry in deployment.pads]
         kinds = [deployment.nodes[pad.node] for pad in pads]

@@ -28,7 +28,7 @@ from handtouch.core.events import (
 )
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
-from handtouch.daemon.child_process import ChildProcess
+from handtouch.daemon.child_process import ChildProcess, process_statistics
 from handtouch.daemon.excitation import ExcitationSchedule
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
@@ -42,8 +42,8 @@ from handtouch.supervisor.ipc import (
     pack_message,
     unpack_worker_message,
 )
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 _UNKNOWN_LOG_GAIN_STD = 0.05
 """Standard deviation of the log gains of an unknown sensor"""
@@ -198,14 +198,10 @@ class SupervisorClient:
 
     def statistics(self) -> dict[str, Any]:
         """Return the state of the supervisor process for the `service` message."""
-        process, status = self.process, self._worker_status
+        status = self._worker_status
+        processed_ns = status.processed_ns if status else None
         return {
-            "state": process.state,
-            "pid": process.pid,
-            "restarts": process.restarts,
-            "exit_reason": process.exit_reason,
-            "lag_s": (self._last_sent_sync_ns - status.processed_ns) * 1e-9 if status else None,
-            "dropped": process.dropped,
+            **process_statistics(self.process, self._last_sent_sync_ns, processed_ns),
             "malformed": self.malformed,
             "late": self.late,
             "summary": status.summary if status else "",

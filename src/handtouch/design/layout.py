@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.field import ElectrodeNetwork, Surface
 from handtouch.field.outline_surface import OutlineSurface
-from handtouch.hand import pad_surface
 
 FloatArray = NDArray[np.float64]
 
@@ -162,8 +161,3 @@ def _outline_lengths(surface: OutlineSurface, knots: FloatArray) -> tuple[FloatA
         at.append(knots[side] + np.maximum.accumulate(np.clip(along, 0, along[-1])))
         length.append(length[-1][-1] + own * steps)
     return np.concatenate(at), np.concatenate(length)
-
-
-def boundary_of(pad: config.Pad) -> BoundaryLengths:
-    """Return the lengths along the boundary of a pad's surface."""
-    return BoundaryLengths(pad_surface(pad))

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,18 +53,6 @@ class DesignResult:
     def value_after(self) -> float:
         """Value of the best layout."""
         return goal_value(self.map_after, self.statistic)
-
-
-class LayoutSpace(Protocol):
-    """Layouts by variables in a box."""
-
-    bounds: list[tuple[float, float]]
-
-    def layout(self, variables: FloatArray) -> ElectrodeLayout:
-        """Return the layout of variables (n,)."""
-
-    def starts(self) -> list[FloatArray]:
-        """Return variables to start from."""
 
 
 class SideLayouts:
@@ -175,9 +162,7 @@ def optimise_layout(
         raise ValueError(
             f"goal {goal.name} needs one electrode on each side; leave out the number of electrodes"
         )
-    space: LayoutSpace = (
-        SideLayouts(task, limits) if electrodes is None else RingLayouts(task, limits, electrodes)
-    )
+    space = SideLayouts(task, limits) if electrodes is None else RingLayouts(task, limits, electrodes)
     search = _Search(task, goal, statistic, space, on_progress)
     best = _rounded(search.run(starts), task, limits)
     fine = task.with_points(_FINE_POINTS)
@@ -195,7 +180,7 @@ class _Search:
         task: PadTask,
         goal: Goal,
         statistic: Statistic,
-        space: LayoutSpace,
+        space: SideLayouts | RingLayouts,
         on_progress: Callable[[str], None],
     ) -> None:
         self._task, self._goal, self._statistic, self._space = task, goal, statistic, space

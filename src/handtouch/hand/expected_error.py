@@ -20,7 +20,7 @@ from handtouch.field import (
     ElectrodeNetwork,
     Surface,
 )
-from handtouch.hand import electrode_network, pad_surface
+from handtouch.hand.pads import electrode_network, pad_surface, sheet_law
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -93,19 +93,11 @@ def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDes
     if chosen is None:
         raise ValueError(f"no pad on link {link}; known links: {', '.join(pad.link for pad in pads)}")
     sheet, node = deployment.sheets[chosen.sheet], deployment.nodes[chosen.node]
-    law = ContactLaw(
-        sheet.contact_ohm_mm2 * 1e-6,
-        sheet.alpha,
-        sheet.contact_radius_mm * 1e-3,
-        sheet.contact_radius_std_mm * 1e-3,
-        sheet.reference_kpa * 1e3,
-        sheet.hertz_force_n,
-    )
     return PadDesign(
         chosen.link,
         pad_surface(chosen),
         electrode_network(chosen, sheet),
-        law,
+        sheet_law(sheet, sheet.contact_ohm_mm2, sheet.alpha, sheet.hertz_force_n),
         node.drive_v,
         node.full_scale_ma * 1e-3,
         node.noise_counts,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.field.contact_law import ContactLaw
 from handtouch.field.model import FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.outline_surface import OutlineSurface
@@ -70,6 +71,20 @@ def pad_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
     spans = surface.perimeter_positions(ends_m)
     network = ElectrodeNetwork.from_arcs(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
     return network.switched(pad.state_numbers) if pad.switch_states else network
+
+
+def sheet_law(
+    sheet: config.Sheet, contact_ohm_mm2: float, alpha: float, hertz_force_n: float | None
+) -> ContactLaw:
+    """Return a contact law in SI units, with the contact radius of the deployment's sheet."""
+    return ContactLaw(
+        contact_ohm_mm2 * 1e-6,
+        alpha,
+        sheet.contact_radius_mm * 1e-3,
+        sheet.contact_radius_std_mm * 1e-3,
+        sheet.reference_kpa * 1e3,
+        hertz_force_n,
+    )
 
 
 def electrode_network(

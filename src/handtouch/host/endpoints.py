@@ -46,5 +46,10 @@ def is_loopback(host: str) -> bool:
 
 
 def to_connect(bound: str) -> str:
-    """Return the endpoint that clients on this machine connect to, of one that the daemon binds."""
+    """Return the endpoint that clients on this machine connect to, of one that the daemon binds.
+
+    Raises ValueError for any free port.
+    """
+    if bound.endswith(":*"):
+        raise ValueError(f"{bound} in [daemon] is any free port; give it a number, or use --endpoint")
     return bound.replace("tcp://*:", "tcp://127.0.0.1:").replace("tcp://0.0.0.0:", "tcp://127.0.0.1:")

@@ -9,23 +9,13 @@ import csv
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from handtouch.record.recording import Recording
 from handtouch.record.tables import Row, Rows, rows_of
 
 _ROW_GROUP_ROWS = 50_000
 _PROGRESS_ROWS = 1000
-
-
-class TableWriter(Protocol):
-    """A table written row by row; `rows` counts them."""
-
-    rows: int
-
-    def write(self, row: Row) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class CsvTableWriter:
@@ -87,10 +77,8 @@ class ParquetTableWriter:
         self._pending_rows = []
 
 
-_TABLE_WRITERS: dict[str, type[CsvTableWriter] | type[ParquetTableWriter]] = {
-    "csv": CsvTableWriter,
-    "parquet": ParquetTableWriter,
-}
+TableWriter = CsvTableWriter | ParquetTableWriter
+_TABLE_WRITERS: dict[str, type[TableWriter]] = {"csv": CsvTableWriter, "parquet": ParquetTableWriter}
 
 
 class _TableFolder:

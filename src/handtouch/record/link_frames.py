@@ -6,13 +6,13 @@ Public names: `LinkFrames`, `LinkTransform`, `quaternion`.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from handtouch.hand import urdf
 
@@ -101,27 +101,11 @@ class LinkFrames:
             if joint.kind == "prismatic":
                 translation = translation + rotation @ joint.axis * at
             else:
-                rotation = rotation @ _axis_rotation(joint.axis, at)
+                rotation = rotation @ Rotation.from_rotvec(at * joint.axis).as_matrix()
         parent, child = self.frame_name(hand, joint.parent), self.frame_name(hand, joint.child)
         return LinkTransform(parent, child, tuple(translation.tolist()), quaternion(rotation))
 
 
 def quaternion(rotation: FloatArray) -> tuple[float, ...]:
     """Return x, y, z, w of a rotation matrix (3, 3), with w >= 0."""
-    # the eigenvector of Bar-Itzhack's matrix for its largest eigenvalue: stable for every rotation
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    k = [
-        [a - e - i, 0, 0, 0],
-        [d + b, e - a - i, 0, 0],
-        [g + c, h + f, i - a - e, 0],
-        [h - f, c - g, d - b, a + e + i],
-    ]
-    found = np.linalg.eigh(np.array(k) / 3)[1][:, -1]
-    return tuple((found * math.copysign(1.0, found[3])).tolist())
-
-
-def _axis_rotation(axis: FloatArray, angle: float) -> FloatArray:
-    """Return the rotation about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross)
+    return tuple(Rotation.from_matrix(rotation).as_quat(canonical=True).tolist())

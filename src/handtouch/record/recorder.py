@@ -130,11 +130,7 @@ class MessageRecorder:
         if now_ns - self._flushed_ns >= _FLUSH_PERIOD_NS:
             self._flushed_ns = now_ns
             self.file.flush()
-        full = (
-            self.file.size >= self._limits.max_bytes
-            or now_ns - self._file_opened_ns >= self._limits.max_duration_ns
-        )
-        due = full or self._needs_state or now_ns - self._state_ns >= _STATE_PERIOD_NS
+        due = self._is_full(now_ns) or self._needs_state or now_ns - self._state_ns >= _STATE_PERIOD_NS
         if due and now_ns - self._state_requested_ns >= _STATE_REQUEST_PERIOD_NS:
             self._state_requested_ns = now_ns
             self.state_requested = True

@@ -14,7 +14,7 @@ from handtouch.calibration.calibration import Gains
 from handtouch.config import Deployment
 from handtouch.supervisor import diagnose
 from handtouch.supervisor.ipc import FloatArray, SampleBlock
-from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.health import Diagnosis
 
 _BLOCK_DURATION_NS, _BLOCK_TICKS = 250_000_000, 20
 """Least duration and number of the samples that are diagnosed together: of fewer, slow or from an overloaded

@@ -27,7 +27,7 @@ from handtouch.calibration.calibration import (
 )
 from handtouch.config import Table
 from handtouch.sheet import BANK_LEARNED, check_learned
-from handtouch.wire.diagnosis import Diagnosis
+from handtouch.wire.health import Diagnosis
 
 MAX_DIAGNOSES = 8
 """Number of diagnoses of one pad in a message."""

@@ -11,10 +11,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from handtouch.calibration.auto_calibration import AutoCalibrator, CalibrationState
 from handtouch.calibration.calibration import (
@@ -35,6 +34,7 @@ from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_stds
+from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
     MAX_TEXT,
@@ -49,8 +49,8 @@ from handtouch.supervisor.ipc import (
     WorkerMessage,
     WorkerStatus,
 )
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 _log = logging.getLogger("handtouch.supervisor")
 _STATUS_PERIOD_NS = 500_000_000
@@ -65,22 +65,6 @@ _MAX_ZERO_CHANGE_SIGMA = 3.0
 
 
 _SWITCHED = "electrodes share channels by switch_states: gains aren't learned, the pad isn't diagnosed"
-
-
-class Diagnostics(Protocol):
-    """Source of diagnoses, as `DeploymentDiagnostics`."""
-
-    def process_block(self, block: SampleBlock) -> Sequence[tuple[int, Diagnosis]]:
-        """Process a block; return the active diagnoses, each with its pad."""
-
-    def dead_electrodes(self) -> Mapping[int, int]:
-        """Return the dead electrodes of pads, by pad, that are located with the others."""
-
-    def set_offsets(self, pad: int, offset_counts: ArrayLike) -> None:
-        """Set the offsets (c,) of a pad from which static loads are detected."""
-
-    def set_gains(self, pad: int, gains: Gains) -> None:
-        """Set the gains of a pad, with their covariance, and discard its contacts so far."""
 
 
 @dataclass
@@ -113,7 +97,7 @@ class SupervisorWorker:
     """
 
     def __init__(
-        self, deployment: Deployment, store: StoreClient, diagnostics: Diagnostics | None = None
+        self, deployment: Deployment, store: StoreClient, diagnostics: DeploymentDiagnostics | None = None
     ) -> None:
         entries = deployment.pads
         models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}

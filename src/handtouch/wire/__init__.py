@@ -15,6 +15,8 @@ from handtouch.wire.codec import (
     check_fields,
     decode,
     encode,
+    from_datagram,
+    to_datagram,
     to_map,
 )
 from handtouch.wire.columns import Column
@@ -112,6 +114,8 @@ __all__ = [
     "check_fields",
     "decode",
     "encode",
+    "from_datagram",
+    "to_datagram",
     "to_map",
     "topic_of",
     "topics_of",

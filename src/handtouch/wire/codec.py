@@ -99,6 +99,16 @@ def decode(parts: Sequence[bytes]) -> Message:
     return typing.cast(Message, message)
 
 
+def to_datagram(message: OutgoingMessage) -> bytes:
+    """Return both parts of a message in one, for a pipe between processes."""
+    return b"\0".join(encode(message))
+
+
+def from_datagram(data: bytes) -> Message:
+    """Return the message that `to_datagram` made the bytes of. Raises WireError, for any bytes."""
+    return decode(data.split(b"\0", 1))
+
+
 class Received(NamedTuple):
     """A received message whose fields aren't checked yet."""
 

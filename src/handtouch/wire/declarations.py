@@ -3,8 +3,8 @@
 Public names: `CLOSED`, `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`,
 `is_array`.
 
-The declarations are the only source of the tables in docs/wire.md (`handtouch.wire.tables`) and of
-docs/wire.schema.json (`handtouch.wire.schema`). A field's docstring is its meaning. Metadata refine the type
+The declarations are the only source of the tables in docs/wire.md and of docs/wire.schema.json (`make
+tables`). A field's docstring is its meaning. Metadata refine the type
 that the code sees:
 
     state: Annotated[PadStateName, PadState]                   # texts of a status

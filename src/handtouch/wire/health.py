@@ -1,12 +1,11 @@
-"""Payloads about the state of pads and joints: `Health`, `JointPositions`."""
+"""Payloads about the state of pads and joints: `Health` and the maps in it, `JointPositions`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, cast
 
-from handtouch.wire.diagnosis import Diagnosis
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.faults import FaultKind
 from handtouch.wire.status import PadState, PadStateName
 
 NodeStateName = Literal[
@@ -15,6 +14,62 @@ NodeStateName = Literal[
 CalibrationStateName = Literal["default", "calibrated", "quarantined", "manual_required", ""]
 AdaptationStatusName = Literal["compensated", "rejected", ""]
 ShearStatusName = Literal["operational", "no_rest", "dead", "saturated", "shorted", ""]
+
+
+class _HealthPart:
+    """A dataclass that `health` publishes as a map."""
+
+    __slots__ = ()
+
+    def to_map(self) -> dict[str, Any]:
+        """Return the map in a health message."""
+        return {field.name: getattr(self, field.name) for field in fields(cast(Any, self))}
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency(_HealthPart):
+    """An error that a node has reported by EMCY, as the topic `health` publishes it."""
+
+    code: int
+    """error code"""
+    register: int
+    """error register (0x1001) in the message"""
+    manufacturer: str
+    """the five manufacturer-specific bytes, ten hexadecimal digits"""
+    text: str
+    """code and register as text"""
+    arrival_ns: int
+    """reception of the first message, on the clock of `t_ns`"""
+    cleared_ns: int | None = None
+    """when the node cleared it, on the clock of `t_ns`; nil while it lasts"""
+    count: int = 1
+    """messages received in succession"""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis(_HealthPart):
+    """One fault of a pad that lasts, as the topic `health` publishes it: kind, cause, evidence, remedy."""
+
+    kind: FaultKind
+    """identifier"""
+    cause: str
+    """cause as text"""
+    evidence: str
+    """evidence as text"""
+    remedy: str
+    """remedy as text"""
+    since_ns: int
+    """begin, on the clock of `t_ns`"""
+    confidence: float = 1.0
+    """probability of this kind, against another or none"""
+    pad_m: tuple[float, float] | None = None
+    """its arc lengths on the pad, from the electrodes x0 and y0"""
+    size_m: float | None = None
+    """its diameter"""
+    position_valid: bool = True
+    """the pad's contact positions can be relied on meanwhile"""
+    force_valid: bool = True
+    """the pad's forces can be relied on meanwhile"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """JSON Schema of every message, from the topic table and its payload classes.
 
-Public names: `json_schema`. docs/wire.schema.json is its result.
+Public names: `json_schema`, whose result is docs/wire.schema.json, and `payload_schema`.
 
 An instance is a message as a map {"topic", "payload"}, with binary values in base64. `#/$defs/published` are
 the messages that the daemon publishes, `#/$defs/inputs` those that it receives.
@@ -42,6 +42,16 @@ def json_schema() -> dict[str, Any]:
     }
 
 
+def payload_schema(payload: type[Any]) -> dict[str, Any]:
+    """Return the schema of one payload as recorded: without references, and with binary values as such."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"handtouch.{payload.__name__}",
+        "description": (payload.__doc__ or "").split("\n", 1)[0],
+        **_map(declared_fields(payload), None),
+    }
+
+
 def _message(topic: Topic, definitions: dict[str, Any]) -> dict[str, Any]:
     published = topic in TOPICS
     fields = declared_fields(topic.payload) if published else input_fields(topic.payload)
@@ -61,7 +71,7 @@ def _message(topic: Topic, definitions: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _map(fields: Sequence[FieldDeclaration], definitions: dict[str, Any]) -> dict[str, Any]:
+def _map(fields: Sequence[FieldDeclaration], definitions: dict[str, Any] | None) -> dict[str, Any]:
     return {
         "type": "object",
         "properties": {field.name: _field(field, definitions) for field in fields},
@@ -69,7 +79,7 @@ def _map(fields: Sequence[FieldDeclaration], definitions: dict[str, Any]) -> dic
     }
 
 
-def _field(field: FieldDeclaration, definitions: dict[str, Any]) -> dict[str, Any]:
+def _field(field: FieldDeclaration, definitions: dict[str, Any] | None) -> dict[str, Any]:
     if field.name == "v":
         return {"const": SCHEMA_VERSION}
     schema = _type(field.hint, definitions)
@@ -87,13 +97,13 @@ def _field(field: FieldDeclaration, definitions: dict[str, Any]) -> dict[str, An
     return schema
 
 
-def _type(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of a type; classes are added to the definitions."""
+def _type(hint: Any, definitions: dict[str, Any] | None) -> dict[str, Any]:
+    """Return the schema of a type; classes are added to the definitions, or inlined without any."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint in _SCALARS:
         return {"type": _SCALARS[hint]}
     if hint is bytes:
-        return {"type": "string", "contentEncoding": "base64"}
+        return {"type": "string", "contentEncoding": "binary" if definitions is None else "base64"}
     if hint is Any:
         return {}
     if origin in (Union, types.UnionType):
@@ -111,6 +121,8 @@ def _type(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
         return {"type": "object", "additionalProperties": values} if values else {"type": "object"}
     if isinstance(hint, type) and issubclass(hint, Enum):
         return {"type": "string", "examples": [member.value for member in hint]}
+    if definitions is None:
+        return _map(inner_fields(hint), None)
     if hint.__name__ not in definitions:
         definitions[hint.__name__] = _map(inner_fields(hint), definitions)
     return {"$ref": f"#/$defs/{hint.__name__}"}

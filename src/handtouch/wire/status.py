@@ -7,7 +7,7 @@ and the type of the names of each, `PadStateName` and so on. A later version may
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Literal, cast
+from typing import Any, Literal
 
 PadStateName = Literal["clear", "touched", "stale", "lost", "faulted", "starting", "off"]
 PositionStatusName = Literal["not_computed", "valid", "unreliable", "invalid"]
@@ -26,18 +26,18 @@ class StatusCode(IntEnum):
     """A code that prints as its name in messages without columns, and equals it: `code == "valid"`."""
 
     @property
-    def text(self) -> str:
-        """Name of the code in messages without columns."""
+    def text(self) -> Any:
+        """Name of the code in messages without columns, of the type `...Name`."""
         return self.name.lower()
 
     def __str__(self) -> str:
-        return self.text
+        return str(self.text)
 
     def __eq__(self, other: object) -> bool:
-        return self.text == other if isinstance(other, str) else int.__eq__(self, other)
+        return bool(self.text == other) if isinstance(other, str) else int.__eq__(self, other)
 
     def __ne__(self, other: object) -> bool:
-        return self.text != other if isinstance(other, str) else int.__ne__(self, other)
+        return bool(self.text != other) if isinstance(other, str) else int.__ne__(self, other)
 
     __hash__ = int.__hash__
 
@@ -60,11 +60,6 @@ class PadState(StatusCode):
     OFF = 6
     """switched off: in no scene, or disabled"""
 
-    @property
-    def text(self) -> PadStateName:
-        """Name of the code in messages without columns."""
-        return cast(PadStateName, self.name.lower())
-
 
 class PositionStatus(StatusCode):
     """Status of a contact's position."""
@@ -77,11 +72,6 @@ class PositionStatus(StatusCode):
     a long one; the covariance includes an extent that explains its currents"""
     INVALID = 3
     """no position agrees with the currents"""
-
-    @property
-    def text(self) -> PositionStatusName:
-        """Name of the code in messages without columns."""
-        return cast(PositionStatusName, self.name.lower())
 
 
 class ForceStatus(StatusCode):
@@ -96,11 +86,6 @@ class ForceStatus(StatusCode):
     """the pad's baseline, or the state of its sheet, is not known well enough yet"""
     INVALID = 4
 
-    @property
-    def text(self) -> ForceStatusName:
-        """Name of the code in messages without columns."""
-        return cast(ForceStatusName, self.name.lower())
-
 
 class FrameStatus(StatusCode):
     """Status of a contact's position in the frame of the palm or the base."""
@@ -112,8 +97,3 @@ class FrameStatus(StatusCode):
     """the joint states that it depends on are too old"""
     INVALID = 3
     """no position on the link, or joints without any joint state"""
-
-    @property
-    def text(self) -> FrameStatusName:
-        """Name of the code in messages without columns."""
-        return cast(FrameStatusName, self.name.lower())

@@ -30,6 +30,8 @@ _BLOCKING_S = 0.1
 class RosNetworkError(RuntimeError):
     """No DDS participant can be opened; the text contains the remedy."""
 
+    exit_status = 2
+
 
 class Quality(Enum):
     """Quality of service of a topic."""

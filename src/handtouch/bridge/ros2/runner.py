@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from handtouch.bridge.options import BridgeError, connect_endpoint
+from handtouch.bridge.options import BridgeError
 from handtouch.bridge.ros2.conflation import Conflation
 from handtouch.client import Subscriber
 from handtouch.client.robot import Robot
 from handtouch.config import Deployment, load
 from handtouch.hand.robot_models import RobotModels
 from handtouch.hand.urdf import read_urdf
+from handtouch.host.endpoints import to_connect
 from handtouch.host.installation import extra_command
 
 _QUEUE_MESSAGES = 20_000
@@ -42,28 +43,26 @@ class RosOptions:
 
 
 def run_ros_bridge(options: RosOptions, stop: threading.Event) -> None:
-    """Relay until `stop`. Raises BridgeError, ConfigError, PermissionError if the daemon rejects the key."""
+    """Relay until `stop`.
+
+    Raises ValueError for wrong options or files, RosNetworkError, PermissionError if the daemon rejects the
+    key.
+    """
     try:
         from handtouch.bridge.ros2 import relay
         from handtouch.bridge.ros2.conversion import Stamper
-        from handtouch.bridge.ros2.network import RosNetwork, RosNetworkError, ros_name
+        from handtouch.bridge.ros2.network import RosNetwork, ros_name
     except ImportError as error:
         raise BridgeError(f"DDS is missing ({error}): {extra_command('ros2')}") from error
-    deployment, path = load(options.config_path), options.config_path
+    deployment = load(options.config_path)
     _check_names(deployment, ros_name)
     settings, stamper = deployment.daemon, Stamper(options.frame_prefix)
     with ExitStack() as opened:
-        try:
-            network = RosNetwork(_domain(options.domain), options.namespace)
-        except RosNetworkError as error:
-            raise BridgeError(str(error)) from error
-        try:
-            stream = connect_endpoint(path, settings.complete)
-            source = Subscriber[Any].open(relay.TOPICS, stream, _QUEUE_MESSAGES, options.key)
-            opened.callback(source.close)
-            robot = opened.enter_context(Robot(connect_endpoint(path, settings.inputs), options.key))
-        except ValueError as error:
-            raise BridgeError(str(error)) from error
+        network = RosNetwork(_domain(options.domain), options.namespace)
+        stream = to_connect(settings.complete)
+        source = Subscriber[Any].open(relay.TOPICS, stream, _QUEUE_MESSAGES, options.key)
+        opened.callback(source.close)
+        robot = opened.enter_context(Robot(to_connect(settings.inputs), options.key))
         outgoing = relay.RosRelay(network, stamper, _palm_links(deployment))
         models = RobotModels(deployment)
         joints = dict(zip(models.hands, models.joint_names, strict=True))

@@ -64,7 +64,7 @@ from handtouch.canbus.nodes.spec import (
 from handtouch.canbus.nodes.transitions import NEVER_NS, STARTED
 from handtouch.canbus.objects.emergency import ReportedErrors, decode_emergency
 from handtouch.canbus.objects.mapping import PdoMapping
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 from handtouch.wire.status import MAX_SILENT_PERIODS
 
 _MIN_STALE_NS = 15_000_000

@@ -31,7 +31,7 @@ from handtouch.config.channels import (
     parse_writable_object,
 )
 from handtouch.config.eds import EdsError
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from handtouch.canbus import cia301
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 
 MAX_EMERGENCIES = 16
 _LAYOUT = struct.Struct("<HB5s")

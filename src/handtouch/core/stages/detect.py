@@ -10,10 +10,10 @@ from typing import Any
 
 from handtouch.core.stages.receive import SampleMemory
 from handtouch.core.stages.solve import VALUE_COUNT
-from handtouch.wire.status import MAX_SILENT_PERIODS
+from handtouch.wire.status import MAX_SILENT_PERIODS, PadState
 
 _VALUES = VALUE_COUNT
-_CLEAR, _TOUCHED, _STALE, _FAULTED, _STARTING = 0, 1, 2, 4, 5  # PadState
+_CLEAR, _TOUCHED, _STALE, _, _FAULTED, _STARTING, _ = map(int, PadState)
 _MAX_SILENT = MAX_SILENT_PERIODS
 _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02  # of a channel's noise, and of all channels
 _NAN = float("nan")

@@ -8,7 +8,7 @@ cdef double _TWO_PI, _INFINITY, _NAN, _MAX_SIGMA, _MIN_RELATIVE_VARIANCE, _MAX_S
 cdef double _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE
 cdef double _CONVERGED_SIGMA, _MIN_CROWDED_FACTOR, _CROWDING_NEAR, _CROWDING_STD
 cdef Py_ssize_t _CROWDING_STEPS
-cdef Py_ssize_t _VALID, _LOWER_BOUND, _NOT_ESTIMATED, _WIDE, _MAX_STEPS
+cdef Py_ssize_t _FITTED, _BOUNDED, _NOT_ESTIMATED, _WIDE, _MAX_STEPS
 
 cdef class StackTable:
     cdef double[::1] inverse, values, nodes

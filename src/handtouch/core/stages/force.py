@@ -20,7 +20,9 @@ import math
 
 from handtouch.field import contact_law
 
-_VALID, _LOWER_BOUND, _NOT_ESTIMATED, _WIDE = 0, 1, 2, 4  # ForceEstimateStatus, of a result
+FITTED, BOUNDED, NOT_ESTIMATED, WIDE = 0, 1, 2, 4
+"""Status of an estimate: a force; a lower bound; none; a force whose spread is too wide to rely on"""
+_FITTED, _BOUNDED, _NOT_ESTIMATED, _WIDE = FITTED, BOUNDED, NOT_ESTIMATED, WIDE
 _LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
 _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH = 5, 6, 7, 8, 14, 15, 16
 LAW_PARAMETERS = 17
@@ -170,7 +172,7 @@ def estimate_force(
                 log_x2 = find_log_x2(stack, least + margin)
             log_force = (log_x2 - law.parameters[_LOG_X2]) * law.parameters[_POWER]
             result.force_n, result.std_n = math.exp(min(_MAX_LOG_FORCE, log_force)), _INFINITY
-            result.status = _LOWER_BOUND
+            result.status = _BOUNDED
             return
     _integrate(stack, law, result, log_x2, top)
 
@@ -252,7 +254,7 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
         unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
         result.force_n = unit * force
         result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
-        result.status = _VALID if mean * inverse < _MAX_SPREAD * weights * weights else _WIDE
+        result.status = _FITTED if mean * inverse < _MAX_SPREAD * weights * weights else _WIDE
 
 
 def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float) -> None:

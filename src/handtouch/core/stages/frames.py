@@ -6,6 +6,7 @@ from typing import Any
 
 from handtouch.core.stages import kinematics
 from handtouch.core.stages.solve import PART_COUNT, PART_SLICES, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
+from handtouch.wire.status import FrameStatus
 
 FRAME_VALUES = 15
 FRAME_SLICES = {"position_m": slice(0, 3), "normal": slice(3, 6), "covariance_m2": slice(6, 15)}
@@ -19,7 +20,7 @@ _PART_COUNT, _PARTS_COUNT, _PART_FRAMES = PART_COUNT, PARTS_COUNT, PART_FRAMES
 _PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
 _PART_COVARIANCE = PART_SLICES["covariance_m2"].start
 _VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
-_NOT_COMPUTED, _VALID, _STALE, _INVALID = 0, 1, 2, 3  # FrameStatus
+_NOT_COMPUTED, _VALID, _STALE, _INVALID = map(int, FrameStatus)
 _NAN, _INFINITY = float("nan"), float("inf")
 _NEVER_NS = 1 << 62
 

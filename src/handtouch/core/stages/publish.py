@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from handtouch.core.stages.force import BOUNDED, WIDE
 from handtouch.core.stages.frames import FRAME_VALUES, PART_FRAMES
 from handtouch.core.stages.solve import (
     MAX_SQUARED_MISFIT,
@@ -18,7 +19,7 @@ from handtouch.core.stages.solve import (
     VALUE_COUNT,
     VALUE_SLICES,
 )
-from handtouch.wire.status import MAX_SILENT_PERIODS
+from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
 
 _VALUES, _FIRST = VALUE_COUNT, VALUE_SLICES["pad_m"].start
 _COUNT = VALUE_SLICES["mount_covariance_m2"].stop - _FIRST
@@ -34,11 +35,10 @@ _POSITION, _FORCE = VALUE_SLICES["position_m"].start, VALUE_SLICES["force_n"].st
 _FORCE_STD, _ESTIMATE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["force_status"].start
 _MISFIT, _MAX_SQUARED_MISFIT = VALUE_SLICES["squared_misfit"].start, MAX_SQUARED_MISFIT
 _IS_BOUND = VALUE_SLICES["is_bound"].start
-_LOWER_BOUND_ESTIMATE, _WIDE_ESTIMATE = 1.0, 4.0  # ForceEstimateStatus
+_BOUNDED_ESTIMATE, _WIDE_ESTIMATE = float(BOUNDED), float(WIDE)
 _NAN, _INFINITY = float("nan"), float("inf")
-_NOT_COMPUTED = 0  # PositionStatus, ForceStatus
-_POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = 1, 2, 3
-_FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID = 1, 2, 3, 4
+_NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = map(int, PositionStatus)
+_NOT_COMPUTED, _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID = map(int, ForceStatus)
 _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 WRITTEN_FIELDS = (
     *("seq", "t_ns", "event", "id", "begin_ns", "duration_s", "age_s", "position_m", "normal"),
@@ -75,7 +75,7 @@ _POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS = (
 )
 _REQUIRED, _HEADER_BYTES = 29, 3
 _PAD_TEXTS = 4
-_FRAME_VALID = 1
+_FRAME_VALID = int(FrameStatus.VALID)
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9
 
@@ -174,7 +174,7 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
         force = _FORCE_VALID
         if not -_INFINITY < value < _INFINITY:
             force = _FORCE_INVALID
-        elif values[first + _ESTIMATE] == _LOWER_BOUND_ESTIMATE:
+        elif values[first + _ESTIMATE] == _BOUNDED_ESTIMATE:
             force = _FORCE_LOWER_BOUND
         elif not columns.known[pad] or columns.reliability[pad] == _EVIDENCE_MISSING:
             force = _FORCE_UNRELIABLE

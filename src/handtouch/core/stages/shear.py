@@ -13,6 +13,7 @@ from typing import Any
 
 from handtouch.core.stages.receive import SampleMemory
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.wire.status import ForceStatus, PadState, PositionStatus
 
 _CHANNELS, _UNKNOWNS, _POINT = 4, 3, 6
 SHEAR_CHANNELS = _CHANNELS
@@ -45,9 +46,9 @@ _VALUES, _PAD_M, _FORCE = VALUE_COUNT, VALUE_SLICES["pad_m"].start, VALUE_SLICES
 _FORCE_STD, _COVARIANCE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["covariance_m2"].start
 _NORMAL = VALUE_SLICES["normal"].start
 _VECTOR = 12  # force and its covariance
-_CLEAR = 0  # PadState
-_NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID = 0, 1, 2, 3, 4  # ForceStatus
-_POSITION_UNRELIABLE, _POSITION_INVALID = 2, 3  # PositionStatus
+_CLEAR = int(PadState.CLEAR)
+_NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID = map(int, ForceStatus)
+_POSITION_UNRELIABLE, _POSITION_INVALID = int(PositionStatus.UNRELIABLE), int(PositionStatus.INVALID)
 _REST_SAMPLES = 64
 REST_SAMPLES = _REST_SAMPLES
 """Untouched samples from which a rest position is measured where there has been no tare."""

@@ -1,7 +1,7 @@
 cimport cython
 
 cdef Py_ssize_t _VALUES, _FORCE, _FORCE_STD, _FORCE_STATUS, _INVALID
-cdef double _LOWER_BOUND, _NAN, _INFINITY
+cdef double _BOUNDED, _NAN, _INFINITY
 cdef long long _MAX_PAUSE_NS
 
 cdef class SheetInterval:

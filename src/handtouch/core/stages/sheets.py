@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from handtouch.core.stages.force import BOUNDED
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
 
 _VALUES = VALUE_COUNT
 _FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
 _FORCE_STATUS = VALUE_SLICES["force_status"].start
-_LOWER_BOUND = 1.0  # ForceEstimateStatus
+_BOUNDED = float(BOUNDED)
 _INVALID = 2  # ForceReliability
 _NAN, _INFINITY = float("nan"), float("inf")
 _MAX_PAUSE_NS = 3600 * 1_000_000_000
@@ -127,7 +128,7 @@ class SheetStage:
             force, first = self.force_n[pad], pad * _VALUES
             self.std_n[pad] = force * self.relative_std[pad]
             self.values[first + _FORCE] = _NAN if self.reliability[pad] == _INVALID else force
-            saturated = self.values[first + _FORCE_STATUS] == _LOWER_BOUND
+            saturated = self.values[first + _FORCE_STATUS] == _BOUNDED
             self.values[first + _FORCE_STD] = _INFINITY if saturated else self.std_n[pad]
 
 

@@ -27,7 +27,7 @@ VALUE_SLICES = {
     "covariance_m2": slice(_COVARIANCE, _COVARIANCE + 9),  # without that of the mount
     "mount_covariance_m2": slice(_MOUNT, _MOUNT + 9),
     "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
-    "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # ForceEstimateStatus
+    "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # of `stages.force`
     "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
     "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, see MAX_SQUARED_MISFIT
     "is_bound": slice(_IS_BOUND, _IS_BOUND + 1),  # 1 where saturated channels leave the position open
@@ -55,7 +55,7 @@ _MOUNT_COUNT = 5
 MOUNT_COUNT = _MOUNT_COUNT
 """Values of a pad's mount."""
 _NAN = float("nan")
-_VALID, _LOWER_BOUND = 0.0, 1.0  # force_status
+_FITTED, _BOUNDED = float(force.FITTED), float(force.BOUNDED)
 _BOUND_SIGMA = contact_law.BOUND_SIGMA
 MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
@@ -239,11 +239,11 @@ def _bound_force(solver: ContactSolver, pad: int) -> None:
     fit.total, fit.var_total = total, variance
     fit.cov_x_total = fit.cov_y_total = 0.0
     _estimate_force(solver, pad, 1.0)
-    if values[row + _FORCE_STATUS] != _LOWER_BOUND and values[row + _FORCE] > 0.0:
+    if values[row + _FORCE_STATUS] != _BOUNDED and values[row + _FORCE] > 0.0:
         relative = values[row + _FORCE_STD] / values[row + _FORCE]
         values[row + _FORCE] *= math.exp(-_BOUND_SIGMA * math.sqrt(math.log(1.0 + relative * relative)))
         values[row + _FORCE_STD] = _INFINITY
-        values[row + _FORCE_STATUS] = _LOWER_BOUND
+        values[row + _FORCE_STATUS] = _BOUNDED
 
 
 def _resolve_pair(solver: ContactSolver, pad: int) -> None:
@@ -324,7 +324,7 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int) -> None:
             variance,
             resistors + step * mutual,
         )
-        if solver.result.status != _VALID:
+        if solver.result.status != _FITTED:
             return
         if step == 0:
             force_n = solver.result.force_n
@@ -429,12 +429,12 @@ def _span_two_patches(solver: ContactSolver, pad: int) -> None:
     one, one_std, status = values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS]
     _estimate_force(solver, pad, 0.5)
     two, two_std = 2.0 * values[row + _FORCE], 2.0 * values[row + _FORCE_STD]
-    if status == _VALID and values[row + _FORCE_STATUS] == _VALID:
+    if status == _FITTED and values[row + _FORCE_STATUS] == _FITTED:
         variance = (1.0 - chance) * one_std * one_std + chance * two_std * two_std
         one_std = math.sqrt(variance + chance * (1.0 - chance) * (two - one) * (two - one))
         one += chance * (two - one)
-    elif status == _LOWER_BOUND:
-        if values[row + _FORCE_STATUS] == _VALID:
+    elif status == _BOUNDED:
+        if values[row + _FORCE_STATUS] == _FITTED:
             two -= _BOUND_SIGMA * two_std
         one += 2.0 * chance * (min(one, max(two, 0.0)) - one)
     values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS] = one, one_std, status

@@ -56,7 +56,7 @@ def refuse_beside_daemon(endpoint: str) -> None:
     """Raise DaemonRunningError if a daemon, which would use the same buses, answers at a control endpoint."""
     try:
         client.request("status", endpoint=to_connect(endpoint), timeout_s=_DAEMON_TIMEOUT_S)
-    except TimeoutError:
+    except (TimeoutError, ValueError):  # or it has any free port, which nobody can know
         return
     except (PermissionError, RuntimeError):
         pass  # it runs, and rejects the request

@@ -14,7 +14,7 @@ from handtouch.canbus.objects.emergency import decode_emergency
 from handtouch.canbus.objects.sdo import SDO_TIMEOUT_S
 from handtouch.procedures.conformance.direct_sdo import DirectSdoClient
 from handtouch.procedures.conformance.line import Line
-from handtouch.wire.emergency import Emergency
+from handtouch.wire.health import Emergency
 
 MS = 1_000_000
 _STRAY_WAIT_NS = 5 * MS

@@ -17,8 +17,8 @@ from handtouch.supervisor.diagnose.contact_faults import ContactFault
 from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrode
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, PadDiagnosis
 from handtouch.supervisor.diagnose.static_load import StaticLoad
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 _ASSUMED_PRESSURE_PA = 20e3
 """Pressure assumed under a stuck object, to estimate its size: that of 0.4 N on a disc of 5 mm diameter."""

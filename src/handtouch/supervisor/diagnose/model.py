@@ -20,8 +20,8 @@ from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.hand import models_with_other_parts, pad_network, pad_surface
-from handtouch.wire.diagnosis import Diagnosis
 from handtouch.wire.faults import FaultKind
+from handtouch.wire.health import Diagnosis
 
 FloatArray = NDArray[np.float64]
 

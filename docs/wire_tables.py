@@ -1,6 +1,6 @@
 """Tables of docs/wire.md and the file docs/wire.schema.json, from the declarations of the payloads.
 
-Public names: `with_tables`. `python -m handtouch.wire.tables docs` writes both files in a folder.
+`make tables` writes both. Public name: `with_tables`.
 
 The page marks each table by a comment: `<!-- table: NAME -->` with `topics`, `internal topics`,
 `status codes` or the name of a class; `required` or `optional` after it selects the keys that are always
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import typing
 from collections.abc import Iterator, Sequence
 from enum import Enum
@@ -150,12 +149,13 @@ def _classes_in(hint: Any) -> Iterator[type[Any]]:
 _FIELDS = _fields_by_class()
 
 
-def main(folder: Path) -> None:
+def main() -> None:
     """Write both files."""
+    folder = Path(__file__).parent
     page = folder / "wire.md"
     page.write_text(with_tables(page.read_text()))
     (folder / "wire.schema.json").write_text(json.dumps(json_schema(), indent=1, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()
