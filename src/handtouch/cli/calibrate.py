@@ -13,7 +13,7 @@ from typing import Any
 from handtouch.calibration.store import StoreError
 from handtouch.cli import requests
 from handtouch.cli.errors import CommandError, failing
-from handtouch.cli.options import find_endpoint, integer, positive_number
+from handtouch.cli.options import add_number, find_endpoint, integer
 from handtouch.cli.requests import add_request
 from handtouch.host.json_output import print_json
 from handtouch.procedures import calibrate
@@ -51,18 +51,18 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         metavar="N",
         help="measurements per weight (default: 3)",
     )
-    guided.add_argument(
+    add_number(
+        guided,
         "--radius-mm",
-        type=positive_number,
-        metavar="MM",
-        help="radius of the contact under the weights (default: the sheet's contact_radius_mm); of a round "
+        "MM",
+        "radius of the contact under the weights (default: the sheet's contact_radius_mm); of a round "
         "base at hertz_force_n, else at the geometric mean of the weights",
     )
-    guided.add_argument(
+    add_number(
+        guided,
         "--radius-std-mm",
-        type=positive_number,
-        metavar="MM",
-        help="error of that radius, 1 sigma (default: contact_radius_std_mm, or 5 %% of --radius-mm)",
+        "MM",
+        "error of that radius, 1 sigma (default: contact_radius_std_mm, or 5 %% of --radius-mm)",
     )
     guided.add_argument("--log", type=Path, metavar="FILE", help="record the readings to this file")
     guided.add_argument(
@@ -80,13 +80,13 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         action="store_false",
         help="don't store the calibration: it lasts until the daemon exits",
     )
-    guided.add_argument(
+    add_number(
+        guided,
         "--seconds",
-        dest="timeout_s",
-        type=positive_number,
+        "S",
+        "time limit for placing a weight or pressing a key",
         default=60.0,
-        metavar="S",
-        help="time limit for placing a weight or pressing a key (default: 60)",
+        dest="timeout_s",
     )
     guided.add_argument(
         "--live", metavar="ENDPOINT", help="the daemon's live stream (default: as the deployment file says)"
@@ -112,11 +112,11 @@ def _add_direct(direct: argparse._ArgumentGroup) -> None:
         metavar=("K", "ALPHA", "OHM"),
         help="contact_ohm_mm2, alpha and ohm_per_square, as in [sheet.NAME]",
     )
-    direct.add_argument(
+    add_number(
+        direct,
         "--hertz-force-n",
-        type=positive_number,
-        metavar="N",
-        help="with --law: hertz_force_n, as in [sheet.NAME] (default: the same radius at every force)",
+        "N",
+        "with --law: hertz_force_n, as in [sheet.NAME] (default: the same radius at every force)",
     )
 
 

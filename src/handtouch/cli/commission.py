@@ -16,7 +16,7 @@ import numpy as np
 
 from handtouch import config
 from handtouch.canbus.nodes.spec import check_nodes
-from handtouch.cli.options import add_bus, add_config, add_json, positive_number
+from handtouch.cli.options import add_bus, add_config, add_json, add_number
 from handtouch.cli.tables import make_table, table_lines
 from handtouch.host.json_output import print_json
 from handtouch.procedures.commission import refuse_beside_daemon, select_rows
@@ -52,14 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="accept nodes found on each other's links without confirmation",
     )
-    parser.add_argument(
-        "--seconds",
-        dest="timeout_s",
-        type=positive_number,
-        default=60.0,
-        metavar="S",
-        help="time limit for a press or a key (default: 60)",
-    )
+    add_number(parser, "--seconds", "S", "time limit for a press or a key", default=60.0, dest="timeout_s")
     add_json(parser)
 
 

@@ -17,7 +17,7 @@ from rich.text import Text
 from handtouch import __version__, config
 from handtouch.canbus.bus.port import Port
 from handtouch.cli.errors import CommandError, failing
-from handtouch.cli.options import add_bus, add_json, positive_number
+from handtouch.cli.options import add_bus, add_json, add_number
 from handtouch.core.slab import Slab
 from handtouch.host.json_output import to_json
 from handtouch.procedures.commission import refuse_beside_daemon
@@ -68,11 +68,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "in the file; repeatable",
     )
     parser.add_argument("--eds", type=Path, metavar="FILE", help="EDS to compare the object dictionary with")
-    parser.add_argument(
+    add_number(
+        parser,
         "--sync-ms",
-        type=positive_number,
-        metavar="MS",
-        help="shortest SYNC period; twice and four times that are tested, too (default: that of the "
+        "MS",
+        "shortest SYNC period; twice and four times that are tested, too (default: that of the "
         "deployment, or 5)",
     )
     parser.add_argument(

@@ -24,7 +24,7 @@ from typing import Literal, Self
 from handtouch import wire
 from handtouch.cli.demo_rate import lower_rate
 from handtouch.cli.errors import failing
-from handtouch.cli.options import positive_number
+from handtouch.cli.options import add_number
 from handtouch.cli.simulate import add_grasp, add_scenario, add_world
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
@@ -69,9 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--details", action="store_true", help="print the accuracy of each pad, too, when the demo ends"
     )
-    parser.add_argument(
-        "--seconds", type=positive_number, metavar="S", help="duration (default: that of the scenario)"
-    )
+    add_number(parser, "--seconds", "S", "duration (default: that of the scenario)")
     parser.add_argument(
         "--config",
         dest="config_path",

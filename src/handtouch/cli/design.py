@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from handtouch import config
 from handtouch.cli.errors import failing, needing
-from handtouch.cli.options import add_config, add_json, add_output, integer, positive_number
+from handtouch.cli.options import add_config, add_json, add_number, add_output, integer
 from handtouch.cli.progress import ProgressLine
 from handtouch.cli.tables import make_table, output_console
 from handtouch.host.json_output import print_json
@@ -50,14 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="default",
         help="tolerances of the parts (default: default; ideal: none, the nominal optimum)",
     )
-    parser.add_argument(
-        "--force",
-        dest="force_n",
-        type=positive_number,
-        default=1.0,
-        metavar="N",
-        help="force of the contacts to design for (default: 1)",
-    )
+    add_number(parser, "--force", "N", "force of the contacts to design for", default=1.0, dest="force_n")
     parser.add_argument(
         "--electrodes",
         type=integer(4, 12, "4 to 12 electrodes"),
@@ -69,13 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("min-gap-mm", 0.3, "least bare length at an end of an electrode"),
         ("min-electrode-mm", 3.0, "least length of an electrode"),
     ):
-        parser.add_argument(
-            f"--{name}",
-            type=positive_number,
-            default=default,
-            metavar="MM",
-            help=f"{text} (default: {default})",
-        )
+        add_number(parser, f"--{name}", "MM", f"{text} (default: {default})", default=default)
     parser.add_argument(
         "--max-series-ohm",
         type=float,

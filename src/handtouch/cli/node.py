@@ -10,7 +10,7 @@ from typing import Any
 
 from handtouch import config
 from handtouch.cli.errors import CommandError, failing
-from handtouch.cli.options import add_config, add_json, integer, positive_number
+from handtouch.cli.options import add_config, add_json, add_number, integer
 from handtouch.cli.tables import make_table, output_console
 from handtouch.host import logs
 from handtouch.host.json_output import print_json
@@ -46,13 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="samples to measure noise with (default: 400)",
     )
-    parser.add_argument(
-        "--period-ms",
-        type=positive_number,
-        default=5.0,
-        metavar="MS",
-        help="time between these samples (default: 5)",
-    )
+    add_number(parser, "--period-ms", "MS", "time between these samples", default=5.0)
     add_json(parser, "print the noise as JSON")
     parser.add_argument(
         "--schema", action="store_true", help="print the JSON schema of the node's file instead"

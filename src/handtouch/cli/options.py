@@ -196,6 +196,21 @@ def add_percepts(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_number(
+    parser: argparse._ActionsContainer,
+    name: str,
+    metavar: str,
+    text: str,
+    *,
+    default: float | None = None,
+    **options: Any,
+) -> None:
+    """Add an option that takes a finite number above 0; its default is stated, unless the text does."""
+    if default is not None and "(default" not in text:
+        text += f" (default: {default:g})"
+    parser.add_argument(name, type=positive_number, metavar=metavar, default=default, help=text, **options)
+
+
 def positive_number(text: str) -> float:
     """Parse a finite number above 0."""
     try:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from handtouch.cli.errors import failing, needing
-from handtouch.cli.options import add_json, add_output, positive_number
+from handtouch.cli.options import add_json, add_number, add_output
 from handtouch.cli.progress import ProgressLine
 from handtouch.host.json_output import print_json
 
@@ -28,13 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="begin, in seconds since the recording's first message (default: 0)",
     )
-    parser.add_argument(
-        "--to",
-        dest="to_s",
-        type=positive_number,
-        metavar="S",
-        help="end, in the same seconds (default: the recording's end)",
-    )
+    add_number(parser, "--to", "S", "end, in the same seconds (default: the recording's end)", dest="to_s")
 
 
 def run(

@@ -14,10 +14,10 @@ from handtouch.cli.errors import failing
 from handtouch.cli.options import (
     add_endpoint,
     add_json,
+    add_number,
     add_output,
     add_percepts,
     find_endpoint,
-    positive_number,
 )
 from handtouch.cli.progress import ProgressLine
 from handtouch.host.installation import extra_command
@@ -49,35 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_json(parser, "print a summary as JSON at the end")
     add_endpoint(parser, "complete", config=False)
-    parser.add_argument(
-        "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
-    )
+    add_number(parser, "--seconds", "S", "duration (default: until Ctrl-C)", default=0.0)
     parser.add_argument(
         "--hand",
         action="store_true",
         help="also record hand frames, all pads in one message per tick (not needed: replay recomputes them)",
     )
     add_percepts(parser)
-    parser.add_argument(
-        "--rotate-mb",
-        type=positive_number,
-        default=0.0,
-        metavar="MB",
-        help="start a new file after this size",
+    add_number(parser, "--rotate-mb", "MB", "start a new file after this size (default: never)", default=0.0)
+    add_number(
+        parser, "--rotate-minutes", "MIN", "start a new file after this time (default: never)", default=0.0
     )
-    parser.add_argument(
-        "--rotate-minutes",
-        type=positive_number,
-        default=0.0,
-        metavar="MIN",
-        help="start a new file after this time",
-    )
-    parser.add_argument(
-        "--keep-free-mb",
-        type=positive_number,
-        default=200.0,
-        metavar="MB",
-        help="stop when the disk has less free space than this (default: 200)",
+    add_number(
+        parser, "--keep-free-mb", "MB", "stop when the disk has less free space than this", default=200.0
     )
 
 

@@ -15,8 +15,8 @@ from handtouch.cli.errors import failing
 from handtouch.cli.options import (
     add_endpoint,
     add_json,
+    add_number,
     comma_separated,
-    positive_number,
 )
 from handtouch.client import request
 from handtouch.client.control import LONG_TIMEOUT_S, SHORT_TIMEOUT_S, SLOW_COMMANDS
@@ -91,9 +91,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         help="owner of a temporary scene, which is added to the other scenes; without it, the default scene "
         "is changed",
     )
-    parser.add_argument(
-        "--lease-s", type=positive_number, metavar="S", help="lifetime of the temporary scene (default: 10)"
-    )
+    add_number(parser, "--lease-s", "S", "lifetime of the temporary scene (default: 10)")
     parser.add_argument(
         "--reset",
         action="store_true",

@@ -17,7 +17,7 @@ from rich.text import Text
 from handtouch import config
 from handtouch.canbus.find.survey import NodeFacts, TpdoFacts, find_channels_of_node
 from handtouch.canbus.find.traffic import describe_identifier
-from handtouch.cli.options import add_bus, add_config, add_json, integer, positive_number
+from handtouch.cli.options import add_bus, add_config, add_json, add_number, integer
 from handtouch.cli.progress import ProgressLine
 from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.host.json_output import to_json
@@ -47,11 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "bus to scan, e.g. can0=socketcan:can0; with CONFIG, the interface to open for bus NAME instead of "
         "the one in the file; repeatable",
     )
-    parser.add_argument(
-        "--seconds",
-        type=positive_number,
-        metavar="S",
-        help="time to listen before nodes are queried (default: 1, with --listen 5)",
+    add_number(
+        parser, "--seconds", "S", "time to listen before nodes are queried (default: 1, with --listen 5)"
     )
     add_json(parser)
     mode = parser.add_mutually_exclusive_group()
@@ -66,13 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find nodes without a node id and store one in each: the deployment's for that serial number, "
         "else the first free one from FIRST_ID upwards, in the order of serial numbers",
     )
-    parser.add_argument(
-        "--lss-wait-ms",
-        type=positive_number,
-        default=5.0,
-        metavar="MS",
-        help="minimum time to wait for an LSS response (default: 5)",
-    )
+    add_number(parser, "--lss-wait-ms", "MS", "minimum time to wait for an LSS response", default=5.0)
 
 
 def run(

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from handtouch import config
 from handtouch.canbus.nodes.spec import check_nodes
 from handtouch.cli.errors import CommandError, failing
-from handtouch.cli.options import add_bus, add_config, positive_number
+from handtouch.cli.options import add_bus, add_config, add_number
 from handtouch.config import shipped
 from handtouch.config.problems import ConfigError
 from handtouch.host.endpoints import GRIPPER_ENDPOINT
@@ -63,9 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--truth", type=Path, metavar="FILE", help="write the ground truth to this file, as JSON lines"
     )
-    parser.add_argument(
-        "--seconds", type=positive_number, metavar="S", help="duration (default: until Ctrl-C)"
-    )
+    add_number(parser, "--seconds", "S", "duration (default: until Ctrl-C)")
     add_world(parser, "ideal")
 
 

@@ -27,7 +27,7 @@ from mcap.reader import make_reader
 
 from handtouch import __version__, config
 from handtouch.cli.errors import CommandError
-from handtouch.cli.options import add_config, add_key, add_output, positive_number
+from handtouch.cli.options import add_config, add_key, add_number, add_output
 from handtouch.client import CONTROL_ENDPOINT, request
 from handtouch.core.compiled import Compilation
 from handtouch.host.endpoints import COMPLETE_ENDPOINT, to_connect
@@ -54,13 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "new archive (default: handtouch-support-HOST-TIME.tar.gz in the current folder)",
         metavar="FILE",
     )
-    parser.add_argument(
-        "--seconds",
-        type=positive_number,
-        default=5.0,
-        metavar="S",
-        help="duration of the recording (default: 5)",
-    )
+    add_number(parser, "--seconds", "S", "duration of the recording", default=5.0)
     parser.add_argument(
         "--log",
         dest="logs",

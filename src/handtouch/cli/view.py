@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from handtouch.cli.errors import CommandError, failing, needing
-from handtouch.cli.options import add_endpoint, add_percepts, integer, positive_number
+from handtouch.cli.options import add_endpoint, add_number, add_percepts, integer
 from handtouch.client import connect
 from handtouch.host.endpoints import is_loopback
 from handtouch.host.signals import stop_on_signals
@@ -36,9 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--open", dest="show", action="store_true", help="open the page, or Foxglove, in a browser"
     )
-    parser.add_argument(
-        "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
-    )
+    add_number(parser, "--seconds", "S", "duration (default: until Ctrl-C)", default=0.0)
     add_percepts(parser)
 
 

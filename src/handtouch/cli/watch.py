@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 
 from handtouch.cli.errors import CommandError, failing
-from handtouch.cli.options import add_endpoint, positive_number
+from handtouch.cli.options import add_endpoint, add_number
 from handtouch.client import UnknownNameError, connect
 from handtouch.view.displays import Display, LineDisplay, LiveDisplay, show_messages
 
@@ -32,9 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", dest="style", action="store_const", const="json", help="print JSON, a line per message"
     )
     parser.add_argument("--wide", action="store_true", help="don't shorten lines to the terminal's width")
-    parser.add_argument(
-        "--seconds", type=positive_number, default=0.0, metavar="S", help="duration (default: until Ctrl-C)"
-    )
+    add_number(parser, "--seconds", "S", "duration (default: until Ctrl-C)", default=0.0)
     parser.set_defaults(style="auto")
 
 

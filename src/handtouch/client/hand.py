@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import zmq
 from zmq import zmq_poll
@@ -36,6 +36,7 @@ from handtouch.client.subscriber import (
     unknown_name,
 )
 from handtouch.client.wrench import Wrench
+from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
 QUEUE_MESSAGES = 10_000
@@ -48,7 +49,7 @@ T = TypeVar("T")
 _LOCAL = ("ipc://", "inproc://", "tcp://127.", "tcp://localhost", "tcp://[::1]")
 
 
-class Hand(LinkColumns):
+class Hand(LinkColumns, AsyncClosing):
     """The newest state of a hand: a control loop calls `latest` or `wait`, and reads arrays by link.
 
         hand.latest()                              # never blocks; drops all frames but the newest
@@ -345,18 +346,6 @@ class Hand(LinkColumns):
     def _check_session(self, seen: HandArrays | None, arrays: HandArrays) -> None:
         if seen is not None and arrays.frame.session != seen.frame.session:
             raise ConnectionError(f"the daemon at {self._connection.endpoint} was restarted; iterate again")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.close()
 
     def _require_arrays(self) -> HandArrays:
         if self._arrays is None:

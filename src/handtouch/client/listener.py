@@ -8,7 +8,9 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from typing import Generic, Self, TypeVar
+from typing import Generic, TypeVar
+
+from handtouch.host.closing import Closing
 
 T = TypeVar("T")
 _POLL_S = 0.02
@@ -16,7 +18,7 @@ _POLL_S = 0.02
 _log = logging.getLogger("handtouch.client")
 
 
-class Listener(Generic[T]):
+class Listener(Closing, Generic[T]):
     """Calls a function in a thread until `close`, or until the function raises.
 
     What it raises is logged at once, kept in `error`, and raised again by `close`. `receive` takes a timeout
@@ -54,12 +56,6 @@ class Listener(Generic[T]):
         if self.error is not None:
             error, self.error = self.error, None
             raise error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _run(self) -> None:
         try:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
 from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.host.closing import Closing
 from handtouch.host.endpoints import INPUTS_ENDPOINT
 from handtouch.wire.inputs import (
     InputMessage,
@@ -35,7 +35,7 @@ _QUEUE_MESSAGES = 16
 _LINGER_MS = 200
 
 
-class Robot:
+class Robot(Closing):
     """The robot's connection to a daemon's inputs endpoint; sending never blocks, and there are no answers.
 
     Messages sent before the connection is up are lost: call `wait_connected` where the first one matters.
@@ -123,12 +123,6 @@ class Robot:
                 break
             self._read_subscriptions()
         return bool(self._hands)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Disconnect; queued messages have 0.2 s to be sent."""

@@ -23,6 +23,7 @@ import zmq
 
 from handtouch import wire
 from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def connect(
     return Subscriber.open(patterns or ("contact/*/*",), endpoint, queue, key)
 
 
-class Subscriber(Generic[M]):
+class Subscriber(AsyncClosing, Generic[M]):
     """Messages of a daemon as typed objects: an iterator and a context manager, blocking or for asyncio.
 
         async with handtouch.connect("hand/*") as frames:
@@ -233,18 +234,6 @@ class Subscriber(Generic[M]):
     async def __aiter__(self) -> AsyncIterator[M]:
         while True:
             yield await self.arecv()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.close()
 
     def _recv(self, timeout_s: float | None) -> tuple[M, list[bytes]] | None:
         end_s = None if timeout_s is None else time.monotonic() + timeout_s

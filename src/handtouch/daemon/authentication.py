@@ -31,6 +31,7 @@ from handtouch.daemon.connections import (
     dropped_connection_requests,
 )
 from handtouch.daemon.endpoints import is_readable
+from handtouch.host.closing import Closing
 
 REFUSAL_CAUSES = {
     "no_key": "client has no key",
@@ -68,7 +69,7 @@ _HANDSHAKE_CAUSES = {0x11000002: "no_key", 0x11000001: "wrong_server_key"}
 _log = logging.getLogger("handtouch.security")
 
 
-class Authenticator:
+class Authenticator(Closing):
     """Controls access to the sockets of one context; `poll` it after every tick.
 
     `refused` counts connections by cause (`REFUSAL_CAUSES`). Without keys (`open` without a folder) any
@@ -166,12 +167,6 @@ class Authenticator:
             return False
         self._connections[connection] = client, endpoint
         return right == "read" or client.rights == "control"
-
-    def __enter__(self) -> Authenticator:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the authentication sockets; call it after the secured sockets are closed."""

@@ -59,6 +59,7 @@ from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
+from handtouch.host.closing import Closing
 from handtouch.host.installation import compile_command
 from handtouch.host.process import process_statistics
 
@@ -86,7 +87,7 @@ class _Resources:
     ports: dict[str, Port]
 
 
-class HandtouchDaemon:
+class HandtouchDaemon(Closing):
     """The running service of a deployment: `open` it, `run` it in one thread, `close` it.
 
     `read` reads the deployment file again for the command `reload`. `folder` is the deployment file's, where
@@ -176,12 +177,6 @@ class HandtouchDaemon:
             daemon = cls(deployment, resources, robots, time.monotonic_ns(), read, folder, on_message)
             stack.pop_all()
         return daemon
-
-    def __enter__(self) -> HandtouchDaemon:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close buses and endpoints."""

@@ -55,12 +55,8 @@ class MetricsExporter:
         pipe = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         pipe[0].setblocking(False)
         exporter = cls(listener, pipe)
-        exporter.start()
+        exporter._restart_thread.start()
         return exporter
-
-    def start(self) -> None:
-        """Start the thread that starts the server process and restarts it when it exits."""
-        self._restart_thread.start()
 
     def send(self, message: wire.Health | wire.Service) -> None:
         """Pass a message to the server process."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from handtouch import wire
@@ -75,6 +75,17 @@ def position_std_m(contact: wire.Contact) -> float:
 def active_errors(health: wire.Health) -> list[str]:
     """Return the errors that the pad's node has reported by EMCY and not cleared."""
     return [f"EMCY {e.get('text')}" for e in health.emergencies if e.get("cleared_ns") is None]
+
+
+def health_news(before: wire.Health | None, health: wire.Health) -> Iterator[tuple[str, str]]:
+    """Yield text and status of what is new about a pad: diagnoses, and that it is calibrated again."""
+    known = {diagnosis.get("kind") for diagnosis in before.diagnoses} if before else set()
+    for diagnosis in health.diagnoses:
+        if diagnosis.get("kind") not in known:
+            yield diagnosis_text(diagnosis), "unreliable"
+    was_uncalibrated = before is not None and before.calibration_state in UNCALIBRATED_STATES
+    if was_uncalibrated and health.calibration_state not in UNCALIBRATED_STATES:
+        yield f"{health.calibration_state} again", "clear"
 
 
 def health_line(health: wire.Health) -> str:

@@ -16,8 +16,8 @@ from handtouch import wire
 from handtouch.view.message_lines import (
     DISCONNECTED_TEXT,
     UNCALIBRATED_STATES,
-    diagnosis_text,
     force_text,
+    health_news,
     position_std_m,
 )
 
@@ -31,6 +31,7 @@ _STYLE_OF_STATE = {
     "clear": "green",
     "touched": "bold cyan",
     "stale": "yellow",
+    "unreliable": "yellow",
     "lost": "bold red",
     "faulted": "bold red",
     "starting": "dim",
@@ -75,7 +76,8 @@ class HandView:
                 text = f"{self._name(message)}: pad {_untouched_state(message)}, node {message.node_state}"
                 why = f": {message.reason}" if message.reason else ""
                 self._add_event(message.t_ns, text + why, _untouched_state(message))
-            self._add_diagnosis_events(before, message)
+            for text, status in health_news(before, message):
+                self._add_event(message.t_ns, f"{self._name(message)}: {text}", status)
         elif isinstance(message, wire.Service):
             self._service = message
 
@@ -109,18 +111,6 @@ class HandView:
         self._contacts[key] = contact
         if contact.event == "begin":
             self._add_event(contact.t_ns, f"{self._name(contact)}: #{contact.id} begins", "touched")
-
-    def _add_diagnosis_events(self, before: wire.Health | None, health: wire.Health) -> None:
-        known = {diagnosis.get("kind") for diagnosis in before.diagnoses} if before else set()
-        for diagnosis in health.diagnoses:
-            if diagnosis.get("kind") not in known:
-                self._add_event(health.t_ns, f"{self._name(health)}: {diagnosis_text(diagnosis)}", "stale")
-        if (
-            before
-            and before.calibration_state in UNCALIBRATED_STATES
-            and health.calibration_state not in UNCALIBRATED_STATES
-        ):
-            self._add_event(health.t_ns, f"{self._name(health)}: {health.calibration_state} again", "clear")
 
     def _add_event(self, t_ns: int, text: str, state: str) -> None:
         self._events.append(

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from handtouch import wire
 from handtouch.client import columns
 from handtouch.config import Deployment
-from handtouch.view.message_lines import UNCALIBRATED_STATES, active_errors, diagnosis_text
+from handtouch.view.message_lines import UNCALIBRATED_STATES, active_errors, diagnosis_text, health_news
 from handtouch.view.page.percepts import PerceptSummaries
 from handtouch.view.page.scene_graph import scene_of
 
@@ -197,16 +197,8 @@ class PageModel:
         elif health.state in _OK_STATES and key in self._faults:
             del self._faults[key]
             self._append_message(health.t_ns, "recovered", "clear", name)
-        known = {diagnosis.get("kind") for diagnosis in before.diagnoses} if before else set()
-        for diagnosis in health.diagnoses:
-            if diagnosis.get("kind") not in known:
-                self._append_message(health.t_ns, diagnosis_text(diagnosis), "unreliable", name)
-        if (
-            before
-            and before.calibration_state in UNCALIBRATED_STATES
-            and health.calibration_state not in UNCALIBRATED_STATES
-        ):
-            self._append_message(health.t_ns, f"{health.calibration_state} again", "clear", name)
+        for text, status in health_news(before, health):
+            self._append_message(health.t_ns, text, status, name)
         self._set_pad(key, health.state)
 
     def _set_pad(self, key: str, state: str) -> None:
