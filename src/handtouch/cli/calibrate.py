@@ -163,7 +163,15 @@ def run(
         values["law"]["hertz_force_n"] = hertz_force_n
     if name is not None:
         values["name"] = name
-    return requests.run_calibrate(endpoint, key, as_json, pad, **values)
+    return requests.run_request(
+        "calibrate",
+        requests.calibration_lines,
+        endpoint=endpoint,
+        key=key,
+        as_json=as_json,
+        pad=pad,
+        **values,
+    )
 
 
 def _find_conflict(

@@ -1,13 +1,13 @@
 """Commands that send one request to a running daemon: tare, scene, snapshot, enable, ...
 
-Each `run_...` sends its request and prints the answer. Exit status 0, 1 (no daemon answers, it refuses, or a
-pad was refused), 2 (an invalid endpoint or key file).
+Exit status 0, 1 (no daemon answers, it refuses, or a pad was refused), 2 (an invalid endpoint or key file).
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from handtouch import wire
@@ -29,39 +29,42 @@ Reply = Mapping[str, Any]
 
 def add_tare(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `tare`."""
-    add_request(parser, run_tare)
+    add_request(parser, partial(run_request, "tare", _tare_lines))
     _add_pads(parser, nargs="*", default=["*"], text="(default: all)")
 
 
 def add_snapshot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `snapshot`."""
-    add_request(parser, run_snapshot)
+    add_request(parser, partial(run_request, "snapshot", _snapshot_lines))
 
 
 def add_disable(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `disable`."""
-    add_request(parser, run_disable)
+    add_request(parser, partial(run_request, "disable", _disabled_lines))
     _add_pads(parser, nargs="+")
     parser.add_argument(
-        "--name", help="name shown as the reason in `status` and health messages (default: your login name)"
+        "--name",
+        default=user_name(),
+        help="name shown as the reason in `status` and health messages (default: your login name)",
     )
 
 
 def add_enable(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `enable`."""
-    add_request(parser, run_enable)
+    add_request(parser, partial(run_request, "enable", _disabled_lines))
     _add_pads(parser, nargs="+")
+    parser.set_defaults(name=user_name())
 
 
 def add_reload(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `reload`."""
-    add_request(parser, run_reload)
+    add_request(parser, partial(run_request, "reload", _reload_lines))
     parser.add_argument("--dry-run", action="store_true", help="print the changes without applying them")
 
 
 def add_log(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `log`."""
-    add_request(parser, run_log)
+    add_request(parser, partial(run_request, "log", _log_lines))
     parser.add_argument(
         "level", choices=("debug", "info", "warning", "error"), help="least severity that is logged"
     )
@@ -69,7 +72,7 @@ def add_log(parser: argparse.ArgumentParser) -> None:
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `scene`."""
-    add_request(parser, run_scene)
+    add_request(parser, partial(run_request, "scene", scene_lines))
     parser.add_argument(
         "--links",
         type=comma_separated,
@@ -123,76 +126,38 @@ def send_request(command: str, endpoint: str, key: str | None, **arguments: Any)
         return request(command, endpoint=endpoint, key=key, timeout_s=timeout_s, **arguments)
 
 
-def print_answer(answer: Reply, as_json: bool, format_lines: Callable[[Reply], Iterable[str]]) -> int:
-    """Print an answer as JSON or as lines; return exit status 0."""
+def run_request(
+    command: str,
+    format_lines: Callable[[Reply], Iterable[str]],
+    *,
+    endpoint: str,
+    key: str | None,
+    as_json: bool,
+    **arguments: Any,
+) -> int:
+    """Send a request with the arguments that aren't None, and print the answer, by default as lines."""
+    given = {name: value for name, value in arguments.items() if value is not None}
+    answer = _with_arrays(send_request(command, endpoint, key, **given))
     if as_json:
         print_json(answer)
     else:
         for line in format_lines(answer):
             print(line)
-    return 0
-
-
-def run_tare(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str]) -> int:
-    """`handtouch tare`: exit status 1 if a pad could not be tared."""
-    answer = send_request("tare", endpoint, key, pads=list(pads))
-    print_answer(answer, as_json, lambda answer: map(_tare_line, answer["pads"]))
-    return 0 if all(pad["tared"] for pad in answer["pads"]) else 1
-
-
-def run_scene(endpoint: str, key: str | None, as_json: bool, **values: Any) -> int:
-    """`handtouch scene`: show the scenes, or change one; values that are None are left unchanged."""
-    changes = {name: value for name, value in values.items() if value is not None}
-    return print_answer(send_request("scene", endpoint, key, **changes), as_json, scene_lines)
-
-
-def run_snapshot(endpoint: str, key: str | None, as_json: bool) -> int:
-    """`handtouch snapshot`: the present state of all pads; as JSON with columns as lists."""
-    return print_answer(_with_arrays(send_request("snapshot", endpoint, key)), as_json, _snapshot_lines)
-
-
-def run_calibrate(endpoint: str, key: str | None, as_json: bool, pad: str, **values: Any) -> int:
-    """`handtouch calibrate` without a measurement: set gains, offsets or law, or print the active ones."""
-    return print_answer(
-        send_request("calibrate", endpoint, key, pad=pad, **values), as_json, _calibration_lines
-    )
-
-
-def run_enable(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str]) -> int:
-    """`handtouch enable`."""
-    answer = send_request("enable", endpoint, key, pads=list(pads), name=user_name())
-    return print_answer(answer, as_json, _disabled_lines)
-
-
-def run_disable(endpoint: str, key: str | None, as_json: bool, pads: Sequence[str], name: str | None) -> int:
-    """`handtouch disable`."""
-    answer = send_request("disable", endpoint, key, pads=list(pads), name=name or user_name())
-    return print_answer(answer, as_json, _disabled_lines)
-
-
-def run_reload(endpoint: str, key: str | None, as_json: bool, dry_run: bool) -> int:
-    """`handtouch reload`: make the daemon read its deployment file again."""
-    return print_answer(send_request("reload", endpoint, key, dry_run=dry_run), as_json, _reload_lines)
-
-
-def run_log(endpoint: str, key: str | None, as_json: bool, level: str) -> int:
-    """`handtouch log`: set the daemon's log level."""
-    return print_answer(send_request("log", endpoint, key, level=level), as_json, _log_lines)
+    return 0 if command != "tare" or all(pad["tared"] for pad in answer["pads"]) else 1
 
 
 def _log_lines(answer: Reply) -> Iterator[str]:
     yield f"log level {answer['level']}, was {answer['previous_level']}"
 
 
-def _tare_line(pad: Reply) -> str:
-    name, offsets = f"{pad['hand']}/{pad['link']}", pad["offset_counts"]
-    if not pad["tared"]:
-        return f"{name}: not tared: {pad['reason']}"
-    counts = ", ".join(f"{offset:.1f}" for offset in offsets)
-    return f"{name}: tared at {counts} counts ({pad['samples']} samples)"
+def _tare_lines(answer: Reply) -> Iterator[str]:
+    for pad in answer["pads"]:
+        counts = ", ".join(f"{offset:.1f}" for offset in pad["offset_counts"])
+        done = f"tared at {counts} counts ({pad['samples']} samples)"
+        yield f"{pad['hand']}/{pad['link']}: {done if pad['tared'] else 'not tared: ' + pad['reason']}"
 
 
-def _calibration_lines(answer: Reply) -> Iterator[str]:
+def calibration_lines(answer: Reply) -> Iterator[str]:
     active, previous = answer["calibration_id"], answer["previous_calibration_id"]
     was = "" if previous == active else f", was {previous}"
     yield f"{answer['hand']}/{answer['link']}: calibration {active}{was}"
@@ -207,7 +172,9 @@ def _calibration_lines(answer: Reply) -> Iterator[str]:
 
 
 def _with_arrays(answer: Reply) -> Reply:
-    """Return an answer to `snapshot` with its columns as arrays."""
+    """Return an answer with the columns of hands as arrays, which `snapshot` has."""
+    if "hands" not in answer:
+        return answer
     columns = wire.COLUMNS[wire.HandFrame]
     hands = {
         name: {key: columns[key].to_array(value) if key in columns else value for key, value in frame.items()}

@@ -1,6 +1,6 @@
 """A child process of the daemon: a helper thread starts it, the hot thread exchanges messages with it.
 
-Public names: `ChildProcess`, `process_statistics`.
+Public names: `ChildProcess`, `child_statistics`.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class ChildProcess:
         self._restart_delay_ns = min(2 * self._restart_delay_ns, _MAX_RESTART_DELAY_NS)
 
 
-def process_statistics(process: ChildProcess, sent_ns: int, processed_ns: int | None) -> dict[str, Any]:
+def child_statistics(process: ChildProcess, sent_ns: int, processed_ns: int | None) -> dict[str, Any]:
     """Return the state of a process for the `service` message.
 
     sent_ns: time of the last message sent; processed_ns: up to which the process has processed, None if

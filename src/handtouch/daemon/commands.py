@@ -125,8 +125,8 @@ class ControlCommands:
         changing: dict[str, Command] = {
             "scene": self._scene,
             "calibrate": self._calibrate,
-            "enable": self._enable,
-            "disable": self._disable,
+            "enable": partial(self._switch, True),
+            "disable": partial(self._switch, False),
             "log": self._set_log_level,
         }
         self.by_name: dict[str, Command] = {
@@ -267,29 +267,18 @@ class ControlCommands:
     def _channels(self, pad: int) -> int:
         return int(self._pipeline.model.electrode_counts[pad])
 
-    def _disable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
+    def _switch(self, enable: bool, arguments: dict[str, Any], now_ns: int) -> Reply:
         request = parse_arguments(_SwitchArguments, arguments)
         pads = np.flatnonzero(self._select_pads(request.pads)).tolist()
-        self._demand.disable(pads, request.name)
-        _log.info(
-            "%s: disabled by %s", ", ".join("/".join(self._pad_names[pad]) for pad in pads), request.name
-        )
-        return self._disabled_reply(now_ns)
-
-    def _enable(self, arguments: dict[str, Any], now_ns: int) -> Reply:
-        request = parse_arguments(_SwitchArguments, arguments)
-        pads = np.flatnonzero(self._select_pads(request.pads)).tolist()
-        self._demand.enable(pads)
-        _log.info(
-            "%s: enabled by %s", ", ".join("/".join(self._pad_names[pad]) for pad in pads), request.name
-        )
-        return self._disabled_reply(now_ns)
-
-    def _disabled_reply(self, now_ns: int) -> Reply:
+        if enable:
+            self._demand.enable(pads)
+        else:
+            self._demand.disable(pads, request.name)
+        names = self.deployment.pad_names
+        switched = "enabled" if enable else "disabled"
+        _log.info("%s: %s by %s", ", ".join(names[pad] for pad in pads), switched, request.name)
         self._demand.update(now_ns)
-        return {
-            "disabled": {"/".join(self._pad_names[pad]): by for pad, by in self._demand.disabled_by.items()}
-        }
+        return {"disabled": {names[pad]: by for pad, by in self._demand.disabled_by.items()}}
 
     def _reload_file(self, arguments: dict[str, Any], now_ns: int) -> Job:
         request = parse_arguments(_ReloadArguments, arguments)

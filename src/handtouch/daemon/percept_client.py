@@ -21,7 +21,7 @@ from handtouch.core.scene import RequestedOutputs
 from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.tick import TickResult
-from handtouch.daemon.child_process import ChildProcess, process_statistics
+from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
 from handtouch.wire import PERCEPT_KINDS, ForceStatus, PositionStatus
 
@@ -124,7 +124,7 @@ class PerceptClient:
     def statistics(self) -> dict[str, Any]:
         """Return the state of the process for the `service` message."""
         processed_ns = self._status.processed_ns if self._status else None
-        statistics = process_statistics(self.process, self._last_sent_sync_ns, processed_ns)
+        statistics = child_statistics(self.process, self._last_sent_sync_ns, processed_ns)
         return {**statistics, "malformed": self.malformed}
 
     def close(self) -> None:

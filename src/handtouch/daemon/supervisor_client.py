@@ -28,7 +28,7 @@ from handtouch.core.events import (
 )
 from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.block_buffer import BlockBuffer
-from handtouch.daemon.child_process import ChildProcess, process_statistics
+from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.daemon.excitation import ExcitationSchedule
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
@@ -201,7 +201,7 @@ class SupervisorClient:
         status = self._worker_status
         processed_ns = status.processed_ns if status else None
         return {
-            **process_statistics(self.process, self._last_sent_sync_ns, processed_ns),
+            **child_statistics(self.process, self._last_sent_sync_ns, processed_ns),
             "malformed": self.malformed,
             "late": self.late,
             "summary": status.summary if status else "",
