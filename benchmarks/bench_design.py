@@ -13,16 +13,11 @@ from __future__ import annotations
 
 from benchmarks.page import ROOT, Report, Row, options, progress
 from handtouch import config
-from handtouch.design import (
-    GOALS,
-    ElectrodeLayout,
-    Goal,
-    PadTask,
-    goal_map,
-    goal_value,
-    optimise_layout,
-    simulated_goal_map,
-)
+from handtouch.design.goals import GOALS, Goal, goal_map, goal_value
+from handtouch.design.layout import ElectrodeLayout
+from handtouch.design.optimise import optimise_layout
+from handtouch.design.pad_task import PadTask
+from handtouch.design.simulated_check import simulated_goal_map
 from handtouch.simulate.worlds import WORLDS, Family
 
 LINK = "index_distal"

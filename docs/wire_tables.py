@@ -18,12 +18,12 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from handtouch.wire.columns import is_array
 from handtouch.wire.declarations import (
     FieldDeclaration,
     declared_fields,
     inner_fields,
     input_fields,
-    is_array,
 )
 from handtouch.wire.inputs import INPUT_TOPICS
 from handtouch.wire.schema import json_schema

@@ -14,20 +14,14 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.cli import main
-from handtouch.design import (
-    GOALS,
-    ElectrodeLayout,
-    FabricationLimits,
-    PadTask,
-    deployment_text,
-    fabrication_drawing,
-    goal_map,
-    goal_value,
-    optimise_layout,
-    pad_with_layout,
-    simulated_goal_map,
-)
+from handtouch.design.deployed import deployment_text, pad_with_layout
 from handtouch.design.drawing import LayeredDrawing, write_dxf, write_svg
+from handtouch.design.fabrication import fabrication_drawing
+from handtouch.design.goals import GOALS, goal_map, goal_value
+from handtouch.design.layout import ElectrodeLayout, FabricationLimits
+from handtouch.design.optimise import optimise_layout
+from handtouch.design.pad_task import PadTask
+from handtouch.design.simulated_check import simulated_goal_map
 from handtouch.hand import electrode_network, pad_network
 from handtouch.hand.expected_error import expected_error, pad_design
 from handtouch.simulate.worlds import WORLDS

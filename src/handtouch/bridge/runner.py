@@ -18,7 +18,6 @@ from handtouch.bridge.options import (
     bridged_daemons,
     is_key_part,
 )
-from handtouch.host.installation import extra_command
 
 if TYPE_CHECKING:
     from handtouch.bridge.relay import Relay
@@ -30,7 +29,8 @@ _POLL_S = 0.2
 def run_bridge(options: BridgeOptions, stop: threading.Event) -> None:
     """Forward topics until `stop`.
 
-    Raises ValueError for wrong options or files, PermissionError if daemons reject the key.
+    Raises ValueError for wrong options or files, ImportError without the extra, PermissionError if daemons
+    reject the key.
     """
     with ExitStack() as opened:
         threads = [_RelayThread(relay, stop) for relay in _open_relays(options, opened)]
@@ -49,10 +49,8 @@ def _open_relays(options: BridgeOptions, opened: ExitStack) -> Iterator[Relay]:
         raise BridgeError(f"--prefix {options.prefix}: must be names separated by /, e.g. lab/robot7")
     if not (options.connect or options.listen or options.zenoh):
         raise BridgeError("no Zenoh network given; use --connect tcp/HOST:7447, --listen, or --zenoh FILE")
-    try:
-        from handtouch.bridge import relay
-    except ImportError as error:
-        raise BridgeError(f"Zenoh is missing ({error}): {extra_command('zenoh')}") from error
+    from handtouch.bridge import relay
+
     session = opened.enter_context(relay.open_session(options))
     for daemon in daemons:
         root = f"{options.prefix}/{daemon.name}"

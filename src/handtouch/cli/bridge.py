@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from handtouch.cli.errors import failing
+from handtouch.cli.errors import failing, needing
 from handtouch.cli.options import Subparsers, add_command, add_config, add_key
 
 
@@ -96,21 +96,26 @@ def run_zenoh(**options: Any) -> int:
     from handtouch.bridge.options import BridgeOptions
     from handtouch.bridge.runner import run_bridge
 
-    return _run(lambda stop: run_bridge(BridgeOptions(**options), stop))
+    return _run("zenoh", lambda stop: run_bridge(BridgeOptions(**options), stop))
 
 
 def run_ros2(**options: Any) -> int:
     """Run the ROS 2 bridge until SIGINT or SIGTERM; exit status as `run_zenoh`."""
     from handtouch.bridge.ros2.runner import RosOptions, run_ros_bridge
 
-    return _run(lambda stop: run_ros_bridge(RosOptions(**options), stop))
+    return _run("ros2", lambda stop: run_ros_bridge(RosOptions(**options), stop))
 
 
-def _run(relay: Callable[[threading.Event], None]) -> int:
+def _run(extra: str, relay: Callable[[threading.Event], None]) -> int:
     from handtouch.host import logs
     from handtouch.host.signals import stop_on_signals
 
     stop = stop_on_signals()
-    with contextlib.closing(logs.start_logging()), failing(1, PermissionError), failing(2, ValueError):
+    with (
+        contextlib.closing(logs.start_logging()),
+        needing(extra),
+        failing(1, PermissionError),
+        failing(2, ValueError),
+    ):
         relay(stop)
     return 0

@@ -16,7 +16,10 @@ from handtouch.cli.tables import make_table, output_console
 from handtouch.host.json_output import print_json
 
 if TYPE_CHECKING:
-    from handtouch.design import DesignResult, ElectrodeLayout, PadTask, Statistic
+    from handtouch.design.goals import Statistic
+    from handtouch.design.layout import ElectrodeLayout
+    from handtouch.design.optimise import DesignResult
+    from handtouch.design.pad_task import PadTask
 
 _COLUMNS = ("electrode", "from, mm", "to, mm", "then bare", "series, ohm")
 _PREFIX = "handtouch design: "
@@ -97,7 +100,10 @@ def run(
     """
     if goal is None:
         return _draw_pad(config_path, link, out, as_json)
-    from handtouch.design import GOALS, FabricationLimits, PadTask, optimise_layout
+    from handtouch.design.goals import GOALS
+    from handtouch.design.layout import FabricationLimits
+    from handtouch.design.optimise import optimise_layout
+    from handtouch.design.pad_task import PadTask
     from handtouch.simulate.worlds import WORLDS
 
     described = WORLDS[world].draw(_CHECK_SEED).describe(config.load(config_path))
@@ -152,7 +158,8 @@ def _simulated(
     task: PadTask, result: DesignResult, world: str, progress: ProgressLine
 ) -> tuple[float, float] | None:
     """Return the goal before and after as simulated; None where it can't be."""
-    from handtouch.design import CHECKED_GOALS, goal_value, simulated_goal_map
+    from handtouch.design.goals import goal_value
+    from handtouch.design.simulated_check import CHECKED_GOALS, simulated_goal_map
     from handtouch.simulate.worlds import WORLDS
 
     if result.goal.name not in CHECKED_GOALS or not result.after.is_on_sides(task.boundary):
@@ -178,8 +185,9 @@ def _write(
 
     Return their paths, and why there is no deployment.
     """
-    from handtouch.design import deployment_text, fabrication_drawing
+    from handtouch.design.deployed import deployment_text
     from handtouch.design.drawing import write_dxf, write_svg
+    from handtouch.design.fabrication import fabrication_drawing
     from handtouch.design.pictures import draw_before_and_after
 
     out.mkdir(parents=True, exist_ok=True)

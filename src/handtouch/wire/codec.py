@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, Union
 
 import msgpack
 
+from handtouch.wire.columns import is_array
 from handtouch.wire.topics import (
     COLUMNS,
     INTERNAL_TOPICS,
@@ -202,7 +203,7 @@ def _expected(hint: Any) -> str:
     if origin in (Union, types.UnionType):
         inner = next(argument for argument in arguments if argument is not type(None))
         return f"{_expected(inner)} or nil"
-    if _is_array(origin):
+    if is_array(hint):
         return "a list of numbers"
     if origin is tuple:
         item = _expected(arguments[0]).split(" ", 1)[1]
@@ -222,11 +223,6 @@ def _describe(value: Any) -> str:
     return _TYPE_NAMES.get(type(value), type(value).__name__)
 
 
-def _is_array(origin: Any) -> bool:
-    """Return True for numpy's array or its alias (numpy 2.5), without importing numpy."""
-    return getattr(origin, "__name__", "") in ("ndarray", "NDArray")
-
-
 def _checker(hint: Any) -> Callable[[Any], Any]:
     """Return a function that returns a value of the annotated type, or raises TypeError or ValueError."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
@@ -235,7 +231,7 @@ def _checker(hint: Any) -> Callable[[Any], Any]:
     if origin in (Union, types.UnionType):
         inner = next(_checker(argument) for argument in arguments if argument is not type(None))
         return lambda value: None if value is None else inner(value)
-    if _is_array(origin):
+    if is_array(hint):
         return _check_array
     if origin is tuple:
         item = _checker(arguments[0])

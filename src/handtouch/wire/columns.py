@@ -1,6 +1,6 @@
 """Columns: fields of a payload that hold one row per pad, as packed little-endian binary.
 
-Public names: `Column`, `columns_of`.
+Public names: `Column`, `columns_of`, `is_array`.
 
 A payload declares a column by annotating a `bytes` field: `force_n: Annotated[bytes, Column("<f4")]`.
 """
@@ -60,6 +60,11 @@ class Column:
         if rows is not None:
             return values.reshape(rows, -1)
         return values if self.elements == 1 else values.reshape(-1, self.elements)
+
+
+def is_array(hint: Any) -> bool:
+    """Return True for the type of a numpy array, without importing numpy (2.5 has an alias)."""
+    return getattr(typing.get_origin(hint), "__name__", "") in ("ndarray", "NDArray")
 
 
 def columns_of(payload: type[Any]) -> dict[str, Column]:

@@ -1,11 +1,9 @@
 """Declarations of payload fields: type, meaning and values.
 
-Public names: `CLOSED`, `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`,
-`is_array`.
+Public names: `CLOSED`, `Values`, `FieldDeclaration`, `declared_fields`, `inner_fields`, `input_fields`.
 
 The declarations are the only source of the tables in docs/wire.md and of docs/wire.schema.json (`make
-tables`). A field's docstring is its meaning. Metadata refine the type
-that the code sees:
+tables`). A field's docstring is its meaning. Metadata refine the type that the code sees:
 
     state: Annotated[PadStateName, PadState]                   # texts of a status
     event: Annotated[Literal["begin", "end"], CLOSED]          # names
@@ -76,11 +74,6 @@ def input_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
     version = FieldDeclaration("v", int, False, False, "schema version", None, None, None)
     declared = (field for field in declared_fields(kind) if field.name != "hand")
     return version, *(field._replace(is_optional=field.is_nilable) for field in declared)
-
-
-def is_array(hint: Any) -> bool:
-    """Return True for the type of a numpy array, without importing numpy (2.5 has an alias)."""
-    return getattr(typing.get_origin(hint), "__name__", "") in ("ndarray", "NDArray")
 
 
 def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, str]) -> FieldDeclaration:

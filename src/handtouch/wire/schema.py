@@ -15,12 +15,12 @@ from enum import Enum
 from typing import Any, Union
 
 from handtouch.wire.codec import SCHEMA_VERSION
+from handtouch.wire.columns import is_array
 from handtouch.wire.declarations import (
     FieldDeclaration,
     declared_fields,
     inner_fields,
     input_fields,
-    is_array,
 )
 from handtouch.wire.inputs import INPUT_TOPICS
 from handtouch.wire.topics import TOPICS, Topic

@@ -21,7 +21,6 @@ from handtouch.config import Deployment, load
 from handtouch.hand.robot_models import RobotModels
 from handtouch.hand.urdf import read_urdf
 from handtouch.host.endpoints import to_connect
-from handtouch.host.installation import extra_command
 
 _QUEUE_MESSAGES = 20_000
 _POLL_S = 0.02
@@ -45,15 +44,13 @@ class RosOptions:
 def run_ros_bridge(options: RosOptions, stop: threading.Event) -> None:
     """Relay until `stop`.
 
-    Raises ValueError for wrong options or files, RosNetworkError, PermissionError if the daemon rejects the
-    key.
+    Raises ValueError for wrong options or files, RosNetworkError, ImportError without the extra, and
+    PermissionError if the daemon rejects the key.
     """
-    try:
-        from handtouch.bridge.ros2 import relay
-        from handtouch.bridge.ros2.conversion import Stamper
-        from handtouch.bridge.ros2.network import RosNetwork, ros_name
-    except ImportError as error:
-        raise BridgeError(f"DDS is missing ({error}): {extra_command('ros2')}") from error
+    from handtouch.bridge.ros2 import relay
+    from handtouch.bridge.ros2.conversion import Stamper
+    from handtouch.bridge.ros2.network import RosNetwork, ros_name
+
     deployment = load(options.config_path)
     _check_names(deployment, ros_name)
     settings, stamper = deployment.daemon, Stamper(options.frame_prefix)
