@@ -10,7 +10,7 @@ import pytest
 from typing_extensions import TypeAliasType
 
 from handtouch.wire.codec import WireError, check_fields
-from handtouch.wire.declarations import is_array
+from handtouch.wire.columns import is_array
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _Alias: Any = TypeAliasType("NDArray", np.ndarray[Any, np.dtype[_Scalar]], type_params=(_Scalar,))  # type: ignore[arg-type]

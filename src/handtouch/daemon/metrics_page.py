@@ -69,7 +69,7 @@ def _loop_metrics(service: wire.Service) -> Iterator[str]:
     yield from _metric(
         "late_ticks_total", "ticks later than one period, by the longest part of the loop", late
     )
-    latency = [({}, service.loop["latency"])] if "latency" in service.loop else []
+    latency: Rows = [({}, service.loop["latency"])] if "latency" in service.loop else []
     text = "latency from a tick's last sample to its last message"
     yield from _histograms("tick_latency_seconds", text, latency)
     stages = _by("stage", service.loop.get("stages", {}))
