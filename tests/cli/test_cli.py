@@ -166,7 +166,7 @@ def test_an_unknown_command_like_no_other_refers_to_the_help(capsys: pytest.Capt
 
 
 WITHOUT_DATA = {
-    *("demo", "run", "simulate", "view", "bridge ros2", "bridge zenoh", "keys revoke"),
+    *("demo", "init", "run", "simulate", "view", "bridge ros2", "bridge zenoh", "keys revoke"),
     *("calibrations export", "support"),  # write files of JSON
 }
 ROOT = Path(__file__).parents[2]
