@@ -87,7 +87,7 @@ def touches(model: PadModel, count: int, seed: int) -> Scenario:
     return Scenario(touch=tuple(made))
 
 
-def block_of(hand: VirtualHand, number: int, pads: int) -> dict[str, Any]:
+def block_of(hand: VirtualHand, number: int, pads: int) -> SampleBlock:
     """The ticks of a contact and one without, as the daemon sends them."""
     first_s = number * STEP_S
     counts = np.array([hand.sample(first_s + (k + 0.5) * PERIOD_NS * 1e-9) for k in range(TICKS + 1)])

@@ -384,7 +384,8 @@ def store_sheet_state(bench: Bench, path: Path, back_n: float) -> None:
     block = bench.block(np.zeros((5, 3, 4)), np.zeros((5, 3), np.uint32), 100)
     sheet = {"back_n": np.array([back_n, np.nan, np.nan]), "back_std_n": np.full(3, 0.1)}
     learned = {"learned_pad": np.array(0, np.int32), "learned": learned_behaviour()}
-    worker.process_message(replace(block, **sheet, **learned), NOW)
+    changes: dict[str, Any] = {**sheet, **learned}
+    worker.process_message(replace(block, **changes), NOW)
     worker.finish(NOW)
 
 
