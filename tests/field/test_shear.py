@@ -111,7 +111,7 @@ def test_off_centre_pressure_looks_like_displacement_unless_its_centre_is_known(
     assert biased[1, 0] < -5e-6
     compensated = pad.estimate(currents, 1e-6, normal_force_n=force, centre_m=centre)
     np.testing.assert_allclose(compensated.motion, 0, atol=1e-12)
-    np.testing.assert_allclose(FILM.normal_force(compensated.conductance_s_per_m2), force, rtol=1e-9)
+    np.testing.assert_allclose(compensated.conductance_s_per_m2, FILM.conductance(force), rtol=1e-9)
     unsure = pad.estimate(currents, 1e-6, normal_force_n=force, centre_m=centre, centre_std_m=1 * MM)
     expected = np.abs(biased[1, 0])  # 1 mm in y moved it so far
     assert math.sqrt(unsure.covariance[0, 1, 1]) == pytest.approx(expected, rel=0.15)

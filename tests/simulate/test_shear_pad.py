@@ -11,7 +11,7 @@ import pytest
 from handtouch.config.shear import Shear
 from handtouch.field.elastic_layer import ElasticLayer
 from handtouch.field.shear import ShearPad, overlap_ratio
-from handtouch.simulate.shear_film import Plates, solve_film, solve_section
+from handtouch.simulate.shear_film import Plates, solve_section
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
 from handtouch.simulate.worlds import WORLDS
 
@@ -39,14 +39,6 @@ def shear(kind: str) -> Shear:
 def test_elements_agree_with_the_closed_form_of_an_overlap(overlap: float) -> None:
     (current,) = solve_section(Plates(((-8.0, overlap),), ((0.0, 8.0),), 1.0))
     assert current == pytest.approx(float(overlap_ratio(overlap)[0]), abs=0.03)
-
-
-def test_volumes_agree_with_an_overlap_without_edges() -> None:
-    plate = np.ones((6, 6))
-    left = np.zeros((6, 6))
-    left[:3] = 1
-    currents = solve_film(plate, [left, 1 - left], 0.1, 0.2, 4)
-    np.testing.assert_allclose(currents, 0.6 * 0.3 / 0.2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", PATTERNS)

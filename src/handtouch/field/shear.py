@@ -326,11 +326,6 @@ class FilmLaw:
         pressure = np.asarray(normal_force_n, np.float64) / self.plate_m2
         return self.siemens_per_m2 * (1 + pressure / self.reference_pa) ** self.alpha
 
-    def normal_force(self, conductance_s_per_m2: npt.ArrayLike) -> FloatArray:
-        """Return the central normal force [N] at a conductance per area: the inverse of `conductance`."""
-        ratio = np.asarray(conductance_s_per_m2, np.float64) / self.siemens_per_m2
-        return self.plate_m2 * self.reference_pa * (ratio ** (1 / self.alpha) - 1)
-
     def tilts(
         self, normal_force_n: npt.ArrayLike, centre_m: npt.ArrayLike, centroids_m: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

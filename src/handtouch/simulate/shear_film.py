@@ -1,29 +1,26 @@
-"""Current through a film between two facing electrode patterns, by finite elements and finite volumes.
+"""Current through the cross-section of a film between the bars of two facing patterns, by finite elements.
 
-Public names: `Plates`, `solve_section` (cross-section of long bars), `solve_film` (a film in plan).
+Public names: `Plates`, `solve_section`.
 
-`solve_section` has bilinear elements on a grid that is graded towards the plates' edges; plates meet the film
-through a specific contact resistance, or impose their potential where it is 0. `solve_film` has cells of one
-size in the plane. Neither uses anything of `handtouch.field`, so that the two can be checked against each
-other.
+Bilinear elements on a grid that is graded towards the plates' edges; plates meet the film through a specific
+contact resistance, or impose their potential where it is 0. Nothing of `handtouch.field` is used, so that the
+two can be checked against each other.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags
-from scipy.sparse.linalg import cg, splu
+from scipy.sparse.linalg import splu
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-_FINE = (1e-5, 1.2)  # element at an edge, in thicknesses of the film, and growth from one to the next
-_COARSE = (1e-2, 2.0)
+_GRADING = (1e-2, 2.0)  # element at an edge, in thicknesses of the film, and growth from one to the next
 _COARSEST = 2.0
 _MARGIN = 4.0  # margin of the film beyond the outermost edge
 _TINY = 1e-6  # length of film that stands for no contact resistance, over the thickness
@@ -42,15 +39,15 @@ class Plates:
     contact_m: float = 0.0
 
 
-def solve_section(plates: Plates, *, fine: bool = False) -> FloatArray:
+def solve_section(plates: Plates) -> FloatArray:
     """Return the currents into the lower plates per metre of bar, per volt, for a film of 1 S/m.
 
-    Errors are those of an overlap that is wider by 0.03 of the film's thickness, `fine` by 0.002.
+    Errors are those of an overlap that is wider by 0.03 of the film's thickness.
     """
-    film, grading = plates.film_m, _FINE if fine else _COARSE
+    film = plates.film_m
     ends = np.unique(np.array([*plates.upper, *plates.lower]).ravel()) / film
-    x = _graded(ends, np.array([ends[0] - _MARGIN, ends[-1] + _MARGIN]), *grading)
-    y = _graded(np.array([0.0, 1.0]), np.array([0.0, 1.0]), *grading)
+    x = _graded(ends, np.array([ends[0] - _MARGIN, ends[-1] + _MARGIN]), *_GRADING)
+    y = _graded(np.array([0.0, 1.0]), np.array([0.0, 1.0]), *_GRADING)
     columns, rows = len(x), len(y)
     node = np.arange(columns * rows).reshape(columns, rows)
     stiffness = _bilinear(x, y, node)
@@ -101,40 +98,3 @@ def _bilinear(x: FloatArray, y: FloatArray, node: IntArray) -> csr_matrix:
     i, j = np.broadcast_arrays(corner[:, None], corner[None, :])
     size = node.size
     return coo_matrix((entries.ravel(), (i.ravel(), j.ravel())), shape=(size, size)).tocsr()
-
-
-def solve_film(
-    upper: FloatArray, lower: Sequence[FloatArray], cell_m: float, film_m: float, layers: int
-) -> FloatArray:
-    """Return the currents into the lower plates per volt, for a film of 1 S/m in cells of finite volumes.
-
-    upper, lower: share (nx, ny) of each cell that is under a plate; cells have the side cell_m. Errors are of
-    the order of a cell at every edge.
-    """
-    nx, ny = upper.shape
-    size = nx * ny * layers
-    node = np.arange(size).reshape(nx, ny, layers)
-    step = film_m / layers
-    side, up = step, cell_m**2 / step
-    pairs = [
-        (node[:-1], node[1:], side),
-        (node[:, :-1], node[:, 1:], side),
-        (node[:, :, :-1], node[:, :, 1:], up),
-    ]
-    first = np.concatenate([a.ravel() for a, _, _ in pairs])
-    second = np.concatenate([b.ravel() for _, b, _ in pairs])
-    value = np.concatenate([np.full(a.size, c) for a, _, c in pairs])
-    matrix = coo_matrix((-value, (first, second)), shape=(size, size))
-    matrix = matrix + matrix.T
-    diagonal = -np.asarray(matrix.sum(axis=1)).ravel()
-    top, bottom = node[:, :, -1], node[:, :, 0]
-    drive = np.zeros(size)
-    drive[top] = 2 * up * upper  # half a cell from its middle to the plate
-    diagonal += drive
-    for plate in lower:
-        diagonal[bottom] += 2 * up * plate
-    system = (matrix + diags(diagonal)).tocsr()
-    potential, failed = cg(system, drive, rtol=1e-9, M=diags(1 / diagonal))
-    if failed:
-        raise RuntimeError(f"conjugate gradients did not converge: {failed}")
-    return np.array([2 * up * (plate * potential[bottom]).sum() for plate in lower])
