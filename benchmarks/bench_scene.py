@@ -55,18 +55,16 @@ def frame_cases(model: PadModel) -> dict[str, PipelineCase]:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--ticks", type=int, default=1000)
-    asked = parser.parse_args()
-    ticks = 20 if asked.quick else asked.ticks
-    report, rows = Report(asked.quick, "outputs and links", ticks=ticks), []
+    quick = options(__doc__).parse_args().quick
+    ticks = 20 if quick else 1000
+    report, rows = Report(quick, "outputs and links", ticks=ticks), []
     for pads in (15, 60):
         model = hands(pads)
         cases = {name: PipelineCase(model, *scene) for name, scene in SCENES.items()}
         rows += [{"pads": pads, **row} for row in in_turns_of(cases, Touches(model), ticks)]
     report.table("Scenes", rows)
     report.keep()
-    report, rows = Report(asked.quick, "palm and base", ticks=ticks), []
+    report, rows = Report(quick, "palm and base", ticks=ticks), []
     for touched in (0, 1, 5, 15):
         model = PadModel(load(shipped.path("utah_mit.toml")))
         rows_of = in_turns_of(frame_cases(model), Touches(model, touched, 0.0), ticks)

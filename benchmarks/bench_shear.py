@@ -177,11 +177,8 @@ def world_rows(touches: int) -> tuple[list[Row], list[Row]]:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--touches", type=int, default=400, help="drawn pads of each row")
-    args = parser.parse_args()
-    quick: bool = args.quick
-    touches = 20 if quick else args.touches
+    quick = options(__doc__).parse_args().quick
+    touches = 20 if quick else 400  # drawn pads of each row
     report = Report(quick, touches_of_a_row=touches)
     worlds, by_force = world_rows(touches)
     report.table("By world and pattern", worlds)

@@ -102,11 +102,9 @@ def slip_row(world: str, name: str, runs: Sequence[Served], on: Sequence[str]) -
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--seeds", type=int, default=3)
-    args = parser.parse_args()
+    args = options(__doc__).parse_args()
     objects = list(GRASP_OBJECTS)[: 1 if args.quick else None]
-    seeds = 1 if args.quick else args.seeds
+    seeds = 1 if args.quick else 3
     plain = load(shipped.path("utah_mit_shear.toml"))
     hand = plain.hands[0].model_copy(update=STATED)
     deployment = plain.model_copy(update={"hands": (hand,)})

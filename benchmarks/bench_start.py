@@ -1,9 +1,8 @@
 """Start: time to the daemon's first hand frame and to the output of a command.
 
 15 simulated nodes are there, on udp_multicast over loopback, and a subscriber waits for `handtouch run` to
-start: the first hand frame, and the first in which every pad delivers. Seconds and MB, medians, warm and cold
-alternately; before a cold start the files of Python and its packages are dropped from the page cache, except
-pages mapped by other processes.
+start: the first hand frame, and the first in which every pad delivers. Seconds and MB, medians, with warm
+caches of files; *no tables*: without cached tables of the pads.
 """
 
 from __future__ import annotations
@@ -11,18 +10,16 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import zmq
 
-from benchmarks.page import Report, options
+from benchmarks.page import Report, Rows, middle, options
 from benchmarks.served_hand import (
     PATHS,
     PORT,
@@ -41,20 +38,6 @@ AIMS = (
     ("first", "first frame", 1.0, "s"), ("no tables", "first frame", 2.0, "s"),
     ("first", "memory", 120.0, "MB"), ("help", "help", 0.3, "s"),
 )  # fmt: skip
-
-
-def forget_files() -> None:
-    """Ask the kernel to drop the pages of Python's and the packages' files."""
-    folders = {Path(sys.prefix), Path(os.__file__).parent, Path(__file__).parents[1] / "src"}
-    for folder in folders:
-        for path in folder.rglob("*"):
-            if path.suffix in (".py", ".pyc", ".so", ".toml", ".eds") or ".so." in path.name:
-                try:
-                    descriptor = os.open(path, os.O_RDONLY)
-                except OSError:  # a dangling link, or not ours to read
-                    continue
-                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-                os.close(descriptor)
 
 
 def first_frames(config: Path) -> dict[str, float]:
@@ -98,13 +81,8 @@ def help_once() -> dict[str, float]:
     return {"help": took_s, "help, processor": used}
 
 
-def medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Return the median of each value."""
-    return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
-
-
-def measure(config: Path, runs: int) -> dict[str, Any]:
-    """Measure warm and cold starts alternately."""
+def measure(config: Path, runs: int) -> Rows:
+    """Return the medians of each case."""
 
     def first_without_tables() -> dict[str, float]:
         shutil.rmtree(cache_path(), ignore_errors=True)
@@ -115,17 +93,8 @@ def measure(config: Path, runs: int) -> dict[str, Any]:
         "first": lambda: first_frames(config),
         "help": help_once,
     }
-    found: dict[str, dict[str, list[dict[str, float]]]] = {
-        cache: {name: [] for name in once} for cache in ("warm", "cold")
-    }
-    for _ in range(runs):
-        for cache, rows in found.items():
-            for name, measured in once.items():
-                if cache == "cold":
-                    forget_files()
-                rows[name].append(measured())
-                print(cache, rows[name][-1], flush=True)
-    return {cache: {name: medians(rows[name]) for name in once} for cache, rows in found.items()}
+    rows = [{"case": case, **measured()} for _ in range(runs) for case, measured in once.items()]
+    return middle(rows, ("case",))
 
 
 def main() -> int:
@@ -146,14 +115,10 @@ def main() -> int:
         stop.set()
         worker.join()
     report = Report(asked.quick, runs=asked.runs)
-    rows = [
-        {"case": f"{case}: {name}", **{cache: of[case][name] for cache, of in results.items()}}
-        for case in ("first", "no tables", "help")
-        for name in results["warm"][case]
-    ]
-    report.table("Start", rows)
+    report.table("Start", results)
+    of_case = {row["case"]: row for row in results}
     for case, name, aim, unit in AIMS:
-        report.limit(f"{case}: {name}, warm", results["warm"][case][name], aim, unit)
+        report.limit(f"{case}: {name}", of_case[case][name], aim, unit)
     return int(not report.keep() and not asked.quick)
 
 

@@ -114,11 +114,9 @@ def measure_shear(ticks: int) -> Rows:
 
 
 def main() -> None:
-    parser = options(__doc__)
-    parser.add_argument("--ticks", type=int, default=200)
-    asked = parser.parse_args()
-    ticks = 5 if asked.quick else asked.ticks
-    report = Report(asked.quick, ticks=ticks)
+    quick = options(__doc__).parse_args().quick
+    ticks = 5 if quick else 200
+    report = Report(quick, ticks=ticks)
     report.table("Microseconds", measure(ticks))
     report.table("Shear pads", measure_shear(ticks))
     report.keep()

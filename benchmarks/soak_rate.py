@@ -1,18 +1,16 @@
-"""Sustained rates of one core: many pads at 1 kHz through the real daemon, and its memory.
+"""Sustained rates of one core: many pads at 1 kHz through the real daemon.
 
 The daemon's hot loop runs in a thread with its nodes, eight pads to an in-process bus with a bounded queue, a
 tenth of the pads touched by sliding contacts, one subscriber to all hands. Its nodes are simulated ones until
 they are booted; then each SYNC is answered with messages made before, while it is sent: their share of a core
 is *generator*. *Core* is the hot thread's: SYNC, receive, tick, send and all other stages. *Sustained*: at
-most 0.1 % of the samples late, and of the periods skipped, without a SYNC. *Memory*: samples of 15 pads at 1
-kHz go through pipeline and publisher as fast as they can, contacts begin and end, and their stamps are the
-clock; growth from a third on (least squares). Exit status 1 if a sample was lost or the memory grows.
+most 0.1 % of the samples late, and of the periods skipped, without a SYNC. Exit status 1 if a sample was
+lost.
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import os
 import queue
 import sys
 import tempfile
@@ -28,21 +26,15 @@ import zmq
 from numpy.typing import NDArray
 
 from benchmarks.page import Report, options
-from benchmarks.served_hand import PATHS, descriptors, film, resident_mb
-from handtouch import wire
+from benchmarks.served_hand import PATHS, film
 from handtouch.config import (
     Bus,
     Deployment,
     load,
     shipped,
 )
-from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import Pipeline
-from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.daemon import HandtouchDaemon
-from handtouch.daemon.publisher import Publisher
 from handtouch.device import DeviceBus
-from handtouch.wire import PadState
 
 PADS_PER_BUS = 8
 AIM = 0.60
@@ -60,12 +52,10 @@ LIMITS: tuple[tuple[int, int], ...] = (
 LIMIT_S = 8.0
 MISSED = 1e-3
 """Fraction of late samples or skipped periods above which a run counts as overrun"""
-PERIOD_NS = 1_000_000
 HEARTBEAT_S = 0.1
 """Heartbeat period of a node"""
 BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
-GROWTH_MB_PER_H = 2.0
 GIL_SWITCH_S = 0.0005
 """Switch interval that `handtouch run` sets"""
 REPORT_PERIOD_S = 15.0
@@ -291,87 +281,22 @@ def watch(
     }
 
 
-def remember(hours: float) -> dict[str, Any]:
-    """Measure memory, descriptors and objects while hours of samples pass pipeline and publisher."""
-    deployment = load(shipped.path("utah_mit.toml"))
-    moving = film(deployment, PATHS["sliding"])
-    untouched = np.rint(np.random.default_rng(2).standard_normal((len(moving), *moving.shape[1:])))
-    script = np.concatenate([moving, untouched.astype(np.int64)]).astype("<i2")
-    rows: list[tuple[float, float, int]] = []
-    with tempfile.TemporaryDirectory(prefix="ht.") as folder, zmq.Context() as context:
-        topics, authenticator = wire.topics_of(deployment.links_by_hand), Authenticator(context)
-        live, complete = (f"ipc://{folder}/{stream}" for stream in ("live", "complete"))
-        publisher = Publisher.open(context, live, complete, topics, authenticator)
-        pipeline = Pipeline(PadModel(deployment), PERIOD_NS, 0.8, publisher)
-        pipeline.node_state[:] = PadState.CLEAR
-        reader = context.socket(zmq.SUB)
-        reader.subscribe("")
-        reader.connect(publisher.endpoints["complete"])
-        time.sleep(0.3)
-        publisher.poll_subscriptions(0)
-        steps = round(hours * 3600e9 / PERIOD_NS)
-        received = 0
-        for step in range(steps):
-            t_ns = (step + 1) * PERIOD_NS
-            pipeline.begin_cycle(t_ns, t_ns)
-            sample: bytes = script[step % len(script)].tobytes()
-            for pad in range(pipeline.slab.size):
-                pipeline.slab.write_pdo(pad, sample[8 * pad : 8 * pad + 8], t_ns + 1000 * pad)
-            pipeline.tick_if_due(t_ns + 20_000)
-            pipeline.prepare_next_tick()
-            while reader.poll(0):
-                reader.recv_multipart()
-                received += 1
-            if step % max(1, steps // 60) == 0:
-                rows.append((t_ns / 3600e9, resident_mb(os.getpid()), descriptors(os.getpid())))
-                print(f"{step / steps:4.0%} of the hour: {rows[-1][1]:.1f} MB", flush=True)
-        begun = pipeline.tick.contacts.begun_count
-        episodes = dict(publisher.congestion_episodes)
-        reader.close(0)
-        publisher.close()
-        authenticator.close()
-    figures = np.array(rows)
-    late = figures[len(figures) // 3 :]  # pools fill at first
-    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0])
-    return {
-        "hours": hours,
-        "ticks": steps,
-        "contacts": begun,
-        "messages": received,
-        "congestion episodes": sum(episodes.values()),
-        "MB at first": rows[1][1],
-        "after a third": float(late[0, 1]),
-        "at the end": rows[-1][1],
-        "MB an hour": slope,
-        "descriptors": [rows[1][2], rows[-1][2]],
-    }
-
-
 def main() -> int:
     parser = options(__doc__)
     parser.add_argument("--minutes", type=float, default=5.0, help="of 60 pads at 1 kHz")
-    parser.add_argument("--hours", type=float, default=1.0, help="of the memory run, compressed; 0: not that")
     asked = parser.parse_args()
     sys.setswitchinterval(GIL_SWITCH_S)
     limits, limit_s = LIMITS, LIMIT_S
     if asked.quick:
-        asked.minutes, asked.hours, limits, limit_s = 0.05, min(asked.hours, 0.01), ((30, 500),), 3.0
-    report = Report(asked.quick, "rates")
+        asked.minutes, limits, limit_s = 0.05, ((30, 500),), 3.0
+    report = Report(asked.quick)
     long = served(60, 1000, 60 * asked.minutes)
     report.table("For a long time", [long])
     report.table("How far it goes", [served(pads, rate_hz, limit_s) for pads, rate_hz in limits])
     report.limit("samples lost", long["lost"], 0)
     report.limit("of a core", long["core, %"], 100 * AIM, "%")
     report.keep()
-    well = long["lost"] == 0
-    if asked.hours:
-        report, memory = Report(asked.quick, "memory"), remember(asked.hours)
-        report.table("Memory", [memory])
-        report.limit("growth", memory["MB an hour"], GROWTH_MB_PER_H, "MB an hour")
-        first, last = memory["descriptors"]
-        report.limit("descriptors more than at first", last - first, 0)
-        well &= report.keep()
-    return int(not well)
+    return int(long["lost"] > 0)
 
 
 if __name__ == "__main__":

@@ -198,14 +198,12 @@ def _sensitivity(f: list[Any], first: int, slope: list[Any]) -> Any:
 
 
 def main() -> int:
-    parser = options(__doc__)
-    parser.add_argument("--size", type=int, default=40, help="cases of a region")
-    asked = parser.parse_args()
-    size = 2 if asked.quick else asked.size
+    quick = options(__doc__).parse_args().quick
+    size = 2 if quick else 40
     warnings.simplefilter("error")
     with np.errstate(all="raise"):
         rows = list(accuracy(size))
-    return report_worst(Report(asked.quick, size=size), rows)
+    return report_worst(Report(quick, size=size), rows)
 
 
 if __name__ == "__main__":
