@@ -20,6 +20,8 @@ MAX_EXTRA_SAMPLES_PER_SYNC = 2
 """Samples beyond one per SYNC from which a node counts as babbling; duplicated frames cause one at most."""
 _MOST_CYCLES = 0.5
 """Part of the cycles with two different samples that is a fault; ones late by a period cause half."""
+_FEW_CYCLES = 0.1
+"""Part of them below which it has ended: a busy bus or host delays some of the samples."""
 _WINDOW_NS = 500_000_000
 _CONTRARY_WINDOWS, _LONE_CONTRARY_WINDOWS = 2, 4
 """Windows in a row before two devices are reported. SYNCs of another producer, which have the same effect on
@@ -76,7 +78,7 @@ class SampleRates:
         found: dict[int, SampleRate] = {}
         for bus in self._buses:
             babbling = _beyond_others(extra, bus) > MAX_EXTRA_SAMPLES_PER_SYNC * periods
-            two = self._are_contrary(_beyond_others(contrary, bus) > _MOST_CYCLES * periods, bus)
+            two = self._are_contrary(_beyond_others(contrary, bus) / periods, bus)
             for slot in bus.slots[babbling | two].tolist():
                 is_contrary = slot not in bus.slots[babbling]
                 found[slot] = SampleRate(1 + round(extra[slot] / periods), is_contrary)
@@ -87,15 +89,19 @@ class SampleRates:
     def _read_counts(self) -> NDArray[np.int64]:
         return np.stack((self._slab.repeat_counts, self._slab.contrary_counts))
 
-    def _are_contrary(self, contrary: NDArray[np.bool_], bus: _BusNodes) -> NDArray[np.bool_]:
-        """Return which nodes of a bus had different samples for long enough, by those of this window."""
+    def _are_contrary(self, fractions: NDArray[np.float64], bus: _BusNodes) -> NDArray[np.bool_]:
+        """Return which nodes of a bus had different samples for long enough; fractions: of the cycles in this
+        window."""
+        needed = _LONE_CONTRARY_WINDOWS if bus.alone else _CONTRARY_WINDOWS
+        before = self._contrary_windows[bus.slots]
+        contrary = fractions > np.where(before >= needed, _FEW_CYCLES, _MOST_CYCLES)
         has_other_producer = bus.port.other_syncs > bus.other_syncs
         bus.other_syncs = bus.port.other_syncs
         synchronous = [not (node.idle or node.transmission_pending or node.event_timed) for node in bus.nodes]
         counted = contrary & synchronous & (not (bus.alone and has_other_producer))
-        windows = np.where(counted, self._contrary_windows[bus.slots] + 1, 0)
+        windows = np.where(counted, before + 1, 0)
         self._contrary_windows[bus.slots] = windows
-        return windows >= (_LONE_CONTRARY_WINDOWS if bus.alone else _CONTRARY_WINDOWS)
+        return windows >= needed
 
 
 def _beyond_others(counts: NDArray[np.int64], bus: _BusNodes) -> NDArray[np.int64]:
