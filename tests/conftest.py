@@ -55,7 +55,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     together. Without SocketCAN skip its tests; in vcan-run it is."""
     durations: Any = config.pluginmanager.get_plugin("durations")
     if config.option.within is not None:
-        items[:] = durations.fastest(items, config.option.within)
+        taken = durations.fastest(items, config.option.within)
+        config.hook.pytest_deselected(items=list(set(items) - set(taken)))
+        items[:] = taken
     durations.sort(items)
     items.sort(key=lambda item: item.path.name != BUILDS_WHEEL)
     if "VCAN_RUN" in os.environ or Path("/sys/class/net/vcan0").exists():

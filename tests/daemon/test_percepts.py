@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from inline_process import InlineProcess
 
+from benchmarks.daemon_settings import InlineProcess
 from handtouch import wire
 from handtouch.config.tables import SceneRequest
 from handtouch.core.pipeline import Pipeline
