@@ -17,7 +17,7 @@ import struct
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -50,7 +50,9 @@ STARVED_NS = 10_000_000
 """Between two looks of a reader, which then had no processor: nobody else's delay counts"""
 NEAR_NS = 2_000_000_000
 """Between the death of a daemon and the end of a loop because of it"""
-PERIODS = 3
+SECOND_NS = 1_000_000_000
+DELAYED_NS = 50_000_000
+"""Between two looks of a reader: nodes without a processor may have sent old samples in this second"""
 LATE_NS = 150_000_000
 """Between a sample and its message, beyond which nodes without processor time may have sampled later, too"""
 MAX_KEPT = 50
@@ -113,6 +115,12 @@ def _shown(scenario: Scenario, link: str) -> list[bool | None]:
     return [True if t else False if c else None for t, c in zip(touched, clear, strict=True)]
 
 
+COLUMNS = (
+    "reads", "frames", "wrenches", "touches compared", "no processor", "unknown", "old, of a slow daemon",
+    "loops ended",
+)  # fmt: skip
+
+
 class Found:
     """Violations by rule, the first of them as text, and how much was checked."""
 
@@ -130,49 +138,50 @@ class Found:
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for a page."""
-        return {"client": self.name, **self.checked, "violations": sum(self.violations.values())}
+        checked = {name: self.checked[name] for name in COLUMNS}
+        return {"client": self.name, **checked, "violations": self.violations.total()}
 
 
 class HandCheck:
     """Compares what a `Hand` shows with the truth.
 
-    `max_age_s`: stated limit of a frame's age; three of the intervals of frames where those are longer, as of
-    a daemon that has too little processor time.
+    `max_age_s`: limit of a frame's age by the stated periods. A daemon with too little processor time sends
+    frames less often, and the hand's own limit becomes longer: such older frames are counted apart.
     """
 
     def __init__(self, hand: Hand, truth: Truth, max_age_s: float, name: str = "Hand") -> None:
         self.hand, self.truth, self.found = hand, truth, Found(name)
         self.worst_age_s = 0.0
         self._max_age_ns = round(1e9 * max_age_s)
-        self._looked_ns = self._starved_ns = time.monotonic_ns()
+        self._looked_ns = time.monotonic_ns()
+        self._starved_ns = self._delayed_ns = 0
         self._ends_ns: list[tuple[int, bool]] = []  # of loops; whether this process was starved then
         self._next_link = cycle(truth.links)
         self._checked: HandArrays | None = None
         self._violating: HandArrays | None = None
-        self._intervals_ns = deque[int](maxlen=3)  # of the newest frames that were shown
 
     def look(self) -> bool:
         """Read the newest frame and check it; return True if there is one."""
-        before_ns = time.monotonic_ns()
+        before_ns, longest_s = time.monotonic_ns(), self.hand.max_age_s
         if before_ns - self._looked_ns > STARVED_NS:
             self._starved_ns = before_ns
+        if before_ns - self._looked_ns > DELAYED_NS:
+            self._delayed_ns = before_ns
         arrays = self.hand.latest()
         if arrays is not None:
-            self.check(arrays, before_ns)
+            self.check(arrays, before_ns, max(longest_s, self.hand.max_age_s))
         self._looked_ns = before_ns
         return arrays is not None
 
     def _is_starved(self, now_ns: int) -> bool:
         return now_ns - self._starved_ns < KNOWN_DEAD_NS
 
-    def check(self, arrays: HandArrays, before_ns: int) -> None:
-        """Check a frame that was shown after `before_ns`."""
+    def check(self, arrays: HandArrays, before_ns: int, longest_s: float) -> None:
+        """Check a frame that was shown after `before_ns`, by the hand's limit of its age."""
         self.found.checked["reads"] += 1
-        self._check_time(arrays, before_ns)
+        self._check_time(arrays, before_ns, longest_s)
         if arrays is self._checked:
             return
-        if self._checked is not None and (passed := arrays.frame.seq - self._checked.frame.seq) > 0:
-            self._intervals_ns.append((arrays.t_ns - self._checked.t_ns) // passed)
         self._checked = arrays
         self.found.checked["frames"] += 1
         touched, sample_ns = self.hand.touched, arrays.sample_ns
@@ -182,15 +191,15 @@ class HandCheck:
         if (link := next(self._next_link)) in arrays.links:
             self._check_force(link)
 
-    def _check_time(self, arrays: HandArrays, before_ns: int) -> None:
+    def _check_time(self, arrays: HandArrays, before_ns: int, longest_s: float) -> None:
         age_ns = before_ns - arrays.t_ns
         self.worst_age_s = max(self.worst_age_s, 1e-9 * age_ns)
-        limit_ns = max(self._max_age_ns, PERIODS * max(self._intervals_ns, default=0))
+        self.found.checked["old, of a slow daemon"] += self._max_age_ns < age_ns
         died_ns = max(self.truth.deaths_ns, default=0)
         if arrays is self._violating:
             return
         violations = self.found.violations.total()
-        if age_ns > limit_ns:
+        if age_ns > max(self._max_age_ns, 1e9 * longest_s):
             self.found.add("age", f"a frame of {1e-6 * age_ns:.1f} ms is shown")
         if arrays.t_ns > time.monotonic_ns() or min(self.hand.age_s.array) < 0:
             self.found.add("age", "a frame or a sample of the future is shown")
@@ -203,6 +212,9 @@ class HandCheck:
     def _check_touch(self, link: str, shown: bool | None, sample_ns: int) -> None:
         if shown is None:
             self.found.checked["unknown"] += 1
+            return
+        if self._looked_ns - self._delayed_ns < SECOND_NS:
+            self.found.checked["no processor"] += 1
             return
         true = self.truth.is_touched(link, sample_ns)
         self.found.checked["touches compared"] += true is not None
@@ -278,6 +290,14 @@ class RosCheck:
         self.truth, self.found = truth, Found("ROS 2 relay")
         self.stamper = Stamper()
         self._unknown_ns: dict[str, int] = {}
+        self._looked_ns, self._delayed_ns = time.monotonic_ns(), 0
+
+    def look(self) -> None:
+        """Note the time: the relay's thread has a processor."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._looked_ns > DELAYED_NS:
+            self._delayed_ns = now_ns
+        self._looked_ns = now_ns
 
     def writer(self, name: str, *_: object) -> _Writer:
         """Return a topic's writer."""
@@ -293,7 +313,9 @@ class RosCheck:
             self._unknown_ns[link] = t_ns
             return
         self._unknown_ns.pop(link, None)
-        true = self.truth.is_touched(link, t_ns) if now_ns - t_ns < LATE_NS else None
+        delayed = now_ns - self._delayed_ns < SECOND_NS or now_ns - t_ns > LATE_NS
+        self.found.checked["no processor"] += delayed
+        true = None if delayed else self.truth.is_touched(link, t_ns)
         self.found.checked["touches compared"] += true is not None
         if true and not any(wrench):
             self.found.add("touch", f"{link} is touched at {t_ns}, its wrench is 0 N")
@@ -329,6 +351,7 @@ def watch_ros(endpoint: str, truth: Truth) -> Iterator[RosCheck]:
         relay, waiting = RosRelay(cast(RosNetwork, check), check.stamper, {}), Conflation()
         with Subscriber[Any].open(TOPICS, endpoint, 10_000, None) as source:
             while not stop.is_set():
+                check.look()
                 if not relay_received(source, waiting, relay, 0.02):
                     if source.has_received and not source.alive:
                         relay.end_session()
