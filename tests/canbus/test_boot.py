@@ -389,7 +389,11 @@ def test_a_late_answer_to_an_earlier_request_starts_the_timeout_again() -> None:
         transport.deliver_response(answers.pop(0))
         return 1 << 62
 
-    transport = SdoTransport(5, lambda _, data: not requests.append(data), 0.005, at_timeout)
+    def send(_: int, data: bytes) -> bool:
+        requests.append(data)
+        return True
+
+    transport = SdoTransport(5, send, 0.005, at_timeout)
     sdo = NodeSdoClient(transport)
     answers.insert(0, answers[0])
     assert sdo.read(0x1018, 1, "vendor id") == 7
