@@ -241,7 +241,6 @@ WAYS: dict[str, Way] = {
     "log-ratio, adjusted (fig. 3)": Way(
         lambda setup: LogRatioTable(setup.rectangle, cells=0).locate, "paper"
     ),
-    "log-ratio, table of 32 cells": Way(lambda setup: LogRatioTable(setup.rectangle).locate, "paper"),
     "exact inverse": Way(exact, "handtouch"),
     "likelihood, exact field": Way(likelihood, "handtouch"),
     "core, new contacts": Way(lambda setup: core(setup, tracked=False), "core"),

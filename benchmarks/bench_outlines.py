@@ -61,12 +61,10 @@ def shapes() -> dict[str, Pad]:
     outlines = {
         "disc, 3": (Outline.circle(1.0), 3, 0.5),
         "disc, 4": (Outline.circle(1.0), 4, 0.5),
-        "disc, 8": (Outline.circle(1.0), 8, 0.5),
         "hexagon, 3": (Outline(corners).at_origin(), 3, 0.5),
         "stadium, 6": (Outline([(0, 0), (1, 0), (1, 1), (0, 1)], [0, 1, 0, 1]).at_origin(), 6, 0.2),
         "L, 5": (l_shape, 5, 0.2),
         "round hole, 4": (holed, 4, 0.2),
-        "strip 10:1, 6": (Outline([(0, 0), (10, 0), (10, 1), (0, 1)]), 6, 0.2),
     }
 
     def make(name: str) -> Pad:

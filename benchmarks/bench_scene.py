@@ -20,13 +20,10 @@ CONTACTS, EVERYTHING = ("contact/",), ("contact/", "hand/")
 SCENES: dict[str, tuple[tuple[str, ...], SceneRequest]] = {
     "all outputs, contacts and hand frames subscribed": (EVERYTHING, SceneRequest()),
     "contacts subscribed": (CONTACTS, SceneRequest()),
-    "hand frames subscribed": (("hand/",), SceneRequest()),
     "no subscriber": ((), SceneRequest()),
     "no outputs: begin, current and end only": (EVERYTHING, SceneRequest(outputs=())),
     "position only": (EVERYTHING, SceneRequest(outputs=("position",))),
     "a fifth of the links": (EVERYTHING, SceneRequest(links=("thumb_*",))),
-    "a fifth of the contacts subscribed": (("contact/hand0/thumb_",), SceneRequest()),
-    "half the rate": (EVERYTHING, SceneRequest(rate_hz=100.0)),
 }
 PLAIN = ("position", "force")
 STATED = {"mount_std_mm": 0.3, "mount_std_deg": 1.0, "joint_std_deg": 0.3}
