@@ -19,6 +19,7 @@ from handtouch.calibration.gains import (
 )
 from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
+from handtouch.field.network import Side
 
 FloatArray = NDArray[np.float64]
 SQUARE = Rectangle(1.0, 1.0)
@@ -294,11 +295,10 @@ def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
     nominal, generator = ElectrodeNetwork(30.0, 24.0, 0.8, 1.0), np.random.default_rng(8)
 
     def with_gaps(more: FloatArray) -> ElectrodeNetwork:
+        sides: tuple[Side, ...] = ("x0", "xa", "y0", "yb")
         electrodes = [
             Electrode(side, 0.8 + before, length - 0.8 - after)
-            for side, length, (before, after) in zip(
-                ("x0", "xa", "y0", "yb"), (24, 24, 30, 30), more.reshape(4, 2), strict=True
-            )
+            for side, length, (before, after) in zip(sides, (24, 24, 30, 30), more.reshape(4, 2), strict=True)
         ]
         return ElectrodeNetwork.from_sides(30.0, 24.0, electrodes, 1.0)
 

@@ -417,7 +417,7 @@ def test_missing_sync_stays_the_reason_after_the_settings_were_checked(rig: Any)
     rig.run(10_000)
     reasons = {rig.status(n).reason.partition(", ")[2] for n in (1, 2, 3)}
     assert len(reasons) == 1
-    assert reasons.pop().endswith("; check its SYNC producer and cable")
+    assert reasons.pop().endswith("; check its SYNC producer")
 
 
 def test_settings_are_checked_too_if_a_pause_hid_the_change(make_rig: Make) -> None:

@@ -125,9 +125,9 @@ def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_cl
     assert files["tables"].read_bytes() == tables
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
     reused = list((cache / "handtouch/compiled").iterdir())
-    assert {file.name.partition("-")[0] for file in reused} == {"tables", "groups"}
-    for file in reused:
-        (folder / file.name).unlink()
+    assert {path.name.partition("-")[0] for path in reused} == {"tables", "groups"}
+    for path in reused:
+        (folder / path.name).unlink()
     done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache), CC="/bin/false")
     assert done.returncode == 0, done.stderr
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]

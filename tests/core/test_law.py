@@ -29,8 +29,8 @@ def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_session
     law = contact_law(sheet, law_of(sheet))
     totals_a = [float(law.current(force, 5.0, sheet.ohm_per_square, centre)) for force in FORCES]
     for seed in range(500, 500 + sessions):
-        law = fitted(Table(weights(), seed).readings()).law
-        model.set_calibration(0, ActiveCalibration("4711-1", law=law))
+        found_law = fitted(Table(weights(), seed).readings()).law
+        model.set_calibration(0, ActiveCalibration("4711-1", law=found_law))
         solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
         for number, (force_n, total_a) in enumerate(zip(FORCES, totals_a, strict=True)):
             currents[0] = total_a * fractions

@@ -59,7 +59,7 @@ class Served:
             np.ones(3, dtype=np.bool_),
             self.pipeline,
             self.nodes,  # type: ignore[arg-type]
-            self.sync,
+            self.sync,  # type: ignore[arg-type]
         )
         self.t_ns = 10**9
         self.wait(1, counts=500)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,7 +25,7 @@ class _Distribution:
 @pytest.fixture
 def installed_from(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     def install(url: str) -> None:
-        monkeypatch.setattr(installation.importlib.metadata, "distribution", lambda _: _Distribution(url))
+        monkeypatch.setattr(importlib.metadata, "distribution", lambda _: _Distribution(url))
 
     return install
 
@@ -51,7 +53,7 @@ def test_an_extra_of_a_wheel_is_installed_by_its_name(
 def test_the_core_is_compiled_where_handtouch_was_installed_from(
     installed_from: Callable[[str], None], has_compiler: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(installation.shutil, "which", lambda _: "/usr/bin/cc" if has_compiler else None)
+    monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/cc" if has_compiler else None)
     installed_from(tmp_path.as_uri())
     assert installation.compile_command().endswith(
         f"pip install --force-reinstall --no-deps --no-cache-dir {tmp_path}"

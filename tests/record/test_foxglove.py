@@ -296,4 +296,4 @@ def test_a_port_in_use_and_a_missing_package_are_reported_with_a_remedy(tmp_path
         assert "--port 0" in text
     (tmp_path / "foxglove.py").write_text("raise ImportError('not here')")
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    assert "handtouch[foxglove]" in run(0, PYTHONPATH=path)
+    assert "[foxglove]" in run(0, PYTHONPATH=path)
