@@ -119,6 +119,23 @@ def test_slow_heartbeat_is_measured_and_its_remedy_named(make_rig: Make) -> None
     assert "raise heartbeat_timeout_ms" in rig.status(1).reason
 
 
+def test_fast_heartbeat_is_measured_and_is_no_twin(make_rig: Make) -> None:
+    rig = make_rig(2)
+    rig.boot()
+    rig.node(1).send_heartbeat = False
+    events = []
+    for _ in range(200):
+        rig.inject(0x701, b"\x05")
+        events += rig.run(50)
+    assert rig.state(1) is NodeState.OPERATIONAL
+    assert "fast heartbeat: every 50 ms instead of 100 ms; set heartbeat_ms = 50" in rig.status(1).reason
+    assert not [event for event in events if "duplicate" in event.reason]
+    for _ in range(100):
+        rig.inject(0x701, b"\x05")
+        rig.run(100)
+    assert (rig.state(1), rig.status(1).reason) == (NodeState.OPERATIONAL, "")
+
+
 def test_heartbeat_slowed_by_another_client_is_repaired_once_the_node_answers(make_rig: Make) -> None:
     """It beats every second when its settings can be read again, and the pad is used all the time."""
     rig = make_rig(2)

@@ -94,8 +94,8 @@ def advance(life: Lifecycle, event: LifecycleEvent, now_ns: int, timing: NodeTim
             return silence.on_samples_missing(life, age_ns, bus_cause, now_ns, timing)
         case IdentifierClash(reason):
             return _on_identifier_clash(life, reason, now_ns, timing)
-        case HeartbeatRate(doubled):
-            return _on_heartbeat_rate(life, doubled, now_ns, timing)
+        case HeartbeatRate():
+            return _on_heartbeat_rate(life, event, now_ns, timing)
         case SampleRate():
             return _on_sample_rate(life, event, now_ns, timing)
         case StandbyRequested(standby):
@@ -370,12 +370,15 @@ def _on_standby_requested(life: Lifecycle, standby: bool, now_ns: int, timing: N
     return life, ()
 
 
-def _on_heartbeat_rate(life: Lifecycle, doubled: bool, now_ns: int, timing: NodeTiming) -> Transition:
-    if not doubled:
+def _on_heartbeat_rate(life: Lifecycle, rate: HeartbeatRate, now_ns: int, timing: NodeTiming) -> Transition:
+    life = silence.end_fast_heartbeat(life)
+    if not rate.doubled:
         return life._replace(duplicate_id=False, due_ns=now_ns if life.duplicate_id else life.due_ns), ()
     # where another master is present, that one may set the heartbeat time
     if life.state is NodeState.ABSENT or timing.role is not BusRole.MASTER:
         return life, ()
+    if rate.samples_single and life.state is NodeState.OPERATIONAL:
+        return silence.on_fast_heartbeat(life, now_ns, timing)
     life = enter(life, NodeState.FAULTED, now_ns, _DUPLICATE_ID_REASON)
     return life._replace(
         duplicate_id=True, fault=None, attempt=life.attempt + 1, due_ns=now_ns + timing.max_retry_ns

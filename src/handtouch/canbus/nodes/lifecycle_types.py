@@ -200,9 +200,13 @@ class SamplesMissing:
 
 @dataclass(frozen=True, slots=True)
 class HeartbeatRate:
-    """Heartbeat rate over a window; `doubled`: twice the configured one, as if two nodes had its id."""
+    """Heartbeat rate over a window; `doubled`: twice the configured one, as if two nodes had its id.
+
+    `samples_single`: meanwhile it sent one sample per SYNC, so that it is one node with fast heartbeats.
+    """
 
     doubled: bool
+    samples_single: bool = False
 
 
 @dataclass(frozen=True, slots=True)

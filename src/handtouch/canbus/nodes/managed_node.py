@@ -65,7 +65,8 @@ class ManagedNode:
     transmission_pending: bool = False  # a change of `idle` is in progress
     request_ns: int = 0  # time of the receiving thread's own request for the change, 0 for none
     request_data: bytes = b""  # data of that request
-    heartbeat_window: tuple[int, int] | None = None  # its start, and `heartbeats` then
+    heartbeat_window: tuple[int, int, int] | None = None
+    """its start, and `heartbeats` and repeated samples then"""
     doubled_windows: int = 0  # consecutive windows with a doubled heartbeat rate
     event_timed: bool = False  # it sends by its event timer, not with SYNC
     errors: ErrorLog = field(default_factory=ErrorLog)

@@ -73,6 +73,7 @@ HEARTBEAT_WINDOW_PERIODS = 10
 """Heartbeat periods over which the heartbeat rate is measured."""
 MIN_DOUBLED_WINDOWS = 2
 """Consecutive windows with a doubled rate that show a duplicate id; delayed heartbeats double one at most."""
+_MAX_SINGLE_REPEATS = 0.25  # repeated samples per SYNC of one node: two nodes have 1
 _MIN_DOUBLED_RATIO = 1.6  # heartbeats received over expected: two nodes have 2
 _MAX_WORKERS = 32
 _MAX_EVENTS = 1024
@@ -295,15 +296,21 @@ class Master:
         """Detect two nodes with one id by a doubled heartbeat rate."""
         if node.heartbeat_window is None:
             return
-        since_ns, before = node.heartbeat_window
+        since_ns, before, repeats_before = node.heartbeat_window
         periods = (now_ns - since_ns) / node.timing.heartbeat_period_ns
         if periods < HEARTBEAT_WINDOW_PERIODS:
             return
-        node.heartbeat_window = (now_ns, node.heartbeats)
+        repeats = int(self._slab.repeat_counts[node.spec.slot])
+        node.heartbeat_window = (now_ns, node.heartbeats, repeats)
         doubled = node.heartbeats - before > _MIN_DOUBLED_RATIO * periods
         node.doubled_windows = node.doubled_windows + 1 if doubled else 0
         if not doubled or node.doubled_windows >= MIN_DOUBLED_WINDOWS:
-            self._advance(node, HeartbeatRate(doubled), now_ns)
+            by_sync = self._sync_period_ns and not (
+                node.idle or node.transmission_pending or node.event_timed
+            )
+            cycles = (now_ns - since_ns) / max(self._sync_period_ns or 0, 1)
+            single = bool(by_sync) and repeats - repeats_before < _MAX_SINGLE_REPEATS * cycles
+            self._advance(node, HeartbeatRate(doubled, single), now_ns)
 
     def _check_samples(self, now_ns: int) -> None:
         arrival_ns = self._slab.arrival_ns
@@ -453,7 +460,8 @@ class Master:
                 self._record_transmission(node, False, now_ns)
                 self._next_due_ns = now_ns
                 if node.heartbeat_window is None:
-                    node.heartbeat_window, node.doubled_windows = (now_ns, node.heartbeats), 0
+                    repeats = int(self._slab.repeat_counts[node.spec.slot])
+                    node.heartbeat_window, node.doubled_windows = (now_ns, node.heartbeats, repeats), 0
                 if result.refusal:
                     self._append_event(node, node.lifecycle.state, result.refusal, now_ns)
             elif isinstance(result, PdoMapping) and self._route_samples(node, result, now_ns):

@@ -1,8 +1,8 @@
 """Silence of a node: samples that stay away, a loss, and whose cause it is.
 
-Public names: `on_slow_heartbeat`, `measure_heartbeat`, `on_samples_missing`, `enter_stale`,
-`explain_silence`, `on_stale_due`, `on_heartbeat_timeout`, `review_loss`, `BUS_CAUSE_DELAY_NS`. Pure
-functions, as in `lifecycle`.
+Public names: `on_slow_heartbeat`, `on_fast_heartbeat`, `end_fast_heartbeat`, `measure_heartbeat`,
+`on_samples_missing`, `enter_stale`, `explain_silence`, `on_stale_due`, `on_heartbeat_timeout`, `review_loss`,
+`BUS_CAUSE_DELAY_NS`. Pure functions, as in `lifecycle`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NO_HEARTBEAT_REASON = (
     "answers over SDO, but sends no heartbeat although its heartbeat time is set (0x1017): "
     "its firmware may hang; power-cycle it"
 )
-_SLOW_HEARTBEAT = "slow heartbeat"
+_SLOW_HEARTBEAT, _FAST_HEARTBEAT = "slow heartbeat", "fast heartbeat"
 _TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
 _CHECK_PENDING = "its PDO and heartbeat settings are being checked"
 
@@ -131,6 +131,22 @@ def on_slow_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Trans
     if timing.role is BusRole.LISTENER or now_ns - life.check_ns <= timing.max_retry_ns:
         return life, ()
     return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
+
+
+def on_fast_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
+    """Report heartbeats that come too often; the node's settings are checked, and again at intervals."""
+    every_ms, configured_ms = life.heartbeat_gap_ns / 1e6, timing.heartbeat_period_ns / 1e6
+    text = f"every {every_ms:.0f} ms instead of {configured_ms:.0f} ms"
+    remedy = f"set heartbeat_ms = {every_ms:.0f}, or the node's 0x1017"
+    life = life._replace(reason=f"{_FAST_HEARTBEAT}: {text}; {remedy}")
+    if now_ns - life.check_ns <= timing.max_retry_ns:
+        return life, ()
+    return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
+
+
+def end_fast_heartbeat(life: Lifecycle) -> Lifecycle:
+    """Return the lifecycle without a report of fast heartbeats."""
+    return life._replace(reason="") if life.reason.startswith(_FAST_HEARTBEAT) else life
 
 
 def measure_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifecycle:
