@@ -76,13 +76,14 @@ examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gr
 test: ## run everything that CI runs
 	@mkdir -p build; log=build/socketcan.txt; : >$$log; \
 	$(MAKE) --no-print-directory --jobs=2 TO=">$$log 2>&1" socketcan others; status=$$?; cat $$log; exit $$status
+	@$(MAKE) --no-print-directory unit
 
 check: ## run lint, types and the fastest tests, as far as `make test` measured them
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types fastest
 
-# beside the tests on SocketCAN, which need a processor in time
+# beside the tests on SocketCAN, which need a processor in time; the other tests would, too
 others: $(VENV)/.dev $(VENV)/.core
-	@nice -n 5 $(MAKE) --no-print-directory lint types docs unit
+	@nice -n 5 $(MAKE) --no-print-directory lint types docs
 
 # for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
@@ -108,7 +109,7 @@ wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
-	$(BIN)/python -m pytest -m "not socketcan" -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@rm -rf build/tests/handtouch # tables of earlier sessions would leave the code that computes them idle

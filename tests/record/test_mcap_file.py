@@ -184,4 +184,6 @@ def test_a_file_size_limit_leaves_all_flushed_messages(tmp_path: Path) -> None:
         signal.signal(signal.SIGXFSZ, handler)
     assert flushed
     assert path.stat().st_size <= 20_000
-    assert [entry.payload["n"] for entry in Recording(path)] == list(range(flushed[-1]))
+    numbers = [entry.payload["n"] for entry in Recording(path)]
+    assert numbers == list(range(len(numbers)))
+    assert len(numbers) >= flushed[-1]  # the limit may fall between the last messages and their index

@@ -144,9 +144,16 @@ def test_samples_match_within_half_a_period_and_ends_never() -> None:
 
 
 def test_hands_are_scored_separately() -> None:
-    truth = touch("tip", 0, 5) + [replace(record, hand="left") for record in touch("tip", 0, 5)]
-    found = score_contacts([replace(c, hand="left") for c in follow(truth[:5], np.zeros((5, 3)))], truth)
+    truth = touch("tip", 0, 10) + [replace(record, hand="left") for record in touch("tip", 0, 10)]
+    found = score_contacts([replace(c, hand="left") for c in follow(truth[:10], np.zeros((10, 3)))], truth)
     assert {tally.name: tally.missed for tally in found.links} == {"right/tip": 1, "left/tip": 0}
+
+
+def test_a_touch_that_begins_as_the_truth_ends_is_not_missed() -> None:
+    seen = touch("tip", 0, 50)
+    late = [replace(record, link="other") for record in touch("tip", 0, 50)[-3:]]
+    found = score_contacts(follow(seen, np.zeros((50, 3))), [*seen, *late])
+    assert (found.total.missed, found.total.touches) == (0, 1)
 
 
 def test_verdict_and_table_fit_a_narrow_terminal() -> None:

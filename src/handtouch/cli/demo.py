@@ -28,6 +28,7 @@ from handtouch.cli.options import add_number
 from handtouch.cli.simulate import add_grasp, add_scenario, add_world
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
+from handtouch.core.pad_model import PadModel
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.host.endpoints import COMPLETE_ENDPOINT, CONTROL_ENDPOINT, INPUTS_ENDPOINT, LIVE_ENDPOINT
@@ -130,7 +131,7 @@ def run(
     with (
         hand,
         TemporaryDirectory(prefix="handtouch-demo-") as folder,
-        HandtouchDaemon.open(deployment, model, folder=Path(folder)) as daemon,
+        _open_daemon(deployment, model, Path(folder)) as daemon,
         _subscribe(daemon) as messages,
         _browser_view(daemon) if view else nullcontext("") as url,
     ):
@@ -269,6 +270,18 @@ def in_process_deployment(deployment: Deployment) -> Deployment:
     alone = {**settings, "keys": None, "sample_window_fraction": _SAMPLE_WINDOW_FRACTION, "supervise": False}
     daemon = deployment.daemon.model_copy(update=alone)
     return deployment.model_copy(update={"buses": buses, "daemon": daemon})
+
+
+def _open_daemon(deployment: Deployment, model: PadModel, folder: Path) -> HandtouchDaemon:
+    """Open the daemon; on free ports where another program has taken the default ones meanwhile."""
+    try:
+        return HandtouchDaemon.open(deployment, model, folder=folder)
+    except OSError:
+        if deployment.daemon.live != LIVE_ENDPOINT:
+            raise
+        settings = dict.fromkeys(_ENDPOINTS, "tcp://127.0.0.1:*")
+        daemon = deployment.daemon.model_copy(update=settings)
+        return HandtouchDaemon.open(deployment.model_copy(update={"daemon": daemon}), model, folder=folder)
 
 
 def _with_default_endpoints(deployment: Deployment) -> Deployment:

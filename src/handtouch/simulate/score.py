@@ -151,22 +151,26 @@ def score_contacts(contacts: Iterable[ContactLike], truth: Sequence[GroundTruth]
     for records in by_link.values():
         records.sort(key=lambda record: record.t_ns)
     period_ns = _period_ns(by_link.values())
+    end_ns = max((record.t_ns for record in truth), default=0)
     hands = {hand for hand, _ in (*by_link, *reported)}
     matched = {
-        key: _MatchedLink(by_link[key], reported[key], period_ns)
+        key: _MatchedLink(by_link[key], reported[key], period_ns, end_ns)
         for key in dict.fromkeys((*by_link, *reported))
     }
     links = [
         _score_link(link if len(hands) == 1 else f"{hand}/{link}", [found])
         for (hand, link), found in matched.items()
     ]
-    return Score(tuple(links), _score_link("all", list(matched.values()) or [_MatchedLink([], [], 0)]))
+    return Score(tuple(links), _score_link("all", list(matched.values()) or [_MatchedLink([], [], 0, 0)]))
 
 
 class _MatchedLink:
     """Contacts of one link, matched to its ground truth."""
 
-    def __init__(self, truth: list[GroundTruth], contacts: list[ContactLike], period_ns: int) -> None:
+    def __init__(
+        self, truth: list[GroundTruth], contacts: list[ContactLike], period_ns: int, end_ns: int = 0
+    ) -> None:
+        """`end_ns`: of all ground truth; touches that begin too late to be noticed before it don't count."""
         times = [record.t_ns for record in truth]
         touch_of = _touch_numbers(truth)
         pairs = []
@@ -181,8 +185,11 @@ class _MatchedLink:
             measured = contact.event != "end" and contact.fresh
             if distance_ns is not None and 2 * distance_ns <= period_ns and measured:
                 pairs.append((contact, truth[nearest], touch_of[nearest]))
-        self.touches = max(touch_of, default=-1) + 1
-        self.missed = self.touches - len({touch for _, _, touch in pairs})
+        noticed = {touch for _, _, touch in pairs}
+        began_ns = dict(zip(reversed(touch_of), reversed(times), strict=True))
+        latest_ns = end_ns - _MAX_DELAY_PERIODS * period_ns if end_ns else times[-1] if times else 0
+        self.touches = sum(touch in noticed or began_ns[touch] <= latest_ns for touch in began_ns)
+        self.missed = self.touches - len(noticed)
         located = [pair for pair in pairs if pair[0].position_m is not None]
         self.error_m = _vectors(np.subtract(_position(c), record.position_m) for c, record, _ in located)
         self.mount_error_m = _vectors(
