@@ -16,7 +16,7 @@ import handtouch
 from handtouch import wire
 from handtouch.client import connection
 from handtouch.client.subscriber import unknown_name
-from tests.client.hand_messages import make_frame, make_service
+from tests.client.hand_messages import make_contact, make_frame, make_service
 
 HANDS = {"right": ["thumb_tip", "index_tip"], "left": ["palm"]}
 
@@ -92,11 +92,25 @@ def test_a_subscription_to_an_unknown_link_raises_in_every_call(
 ) -> None:
     with handtouch.connect("contact/right/tumb_tip", endpoint=endpoints["live"]) as contacts:
         _send_service(publisher, 2)
+        for seq in (2, 3):  # `service` comes twice a second
+            publisher.send_multipart(wire.encode(make_service(seq)))
         for _ in range(2):
             with pytest.raises(handtouch.UnknownNameError, match="did you mean 'thumb_tip'"):
                 contacts.recv(5)
         with pytest.raises(handtouch.UnknownNameError):
             asyncio.run(contacts.arecv(5))
+
+
+def test_a_subscription_to_a_link_that_the_daemon_has_after_a_restart_receives(
+    publisher: Any, endpoints: dict[str, str]
+) -> None:
+    with handtouch.connect("contact/right/thumb_tip", endpoint=endpoints["live"]) as contacts:
+        _send_service(publisher, 2, hands={"left": ["palm"]})
+        with pytest.raises(handtouch.UnknownNameError):
+            contacts.recv(5)
+        publisher.send_multipart(wire.encode(make_service(session=2)))
+        publisher.send_multipart(wire.encode(make_contact("thumb_tip", "begin", 1, session=2)))
+        assert contacts.recv(5).link == "thumb_tip"
 
 
 @pytest.fixture(autouse=True)

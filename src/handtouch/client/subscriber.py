@@ -101,7 +101,7 @@ def connect(
 
     Raises ValueError for a pattern that matches no topic, or one of another `kind`, an invalid endpoint or an
     unusable key file. Receiving raises PermissionError when the daemon rejects this client, and
-    UnknownNameError when a pattern matches none of its hands or links.
+    UnknownNameError, twice a second, while a pattern matches none of its hands or links.
     """
     for pattern in patterns:
         if kind is not None and _check_pattern(pattern) != [kind]:
@@ -129,8 +129,6 @@ class Subscriber(AsyncClosing, Generic[M]):
         self._last_receive_s = time.monotonic()
         self._has_received = False
         self._disconnects = 0  # before the last message
-        self._is_checked = False  # by the daemon's hands and links
-        self._unknown: UnknownNameError | None = None
 
     @classmethod
     def open(
@@ -246,8 +244,6 @@ class Subscriber(AsyncClosing, Generic[M]):
     def _receive_nowait(self) -> tuple[M, list[bytes]] | None:
         """Return the next matching message that was received already, and its parts."""
         while True:
-            if self._unknown is not None:
-                raise UnknownNameError(*self._unknown.args)
             try:
                 parts = self.connection.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -258,15 +254,13 @@ class Subscriber(AsyncClosing, Generic[M]):
     def _note_reception(self) -> None:
         self._last_receive_s, self._has_received = time.monotonic(), True
         self.connection.note_message()
-        if self._disconnects != self.connection.disconnects:
-            self._disconnects = self.connection.disconnects
-            self._is_checked, self._unknown = False, None
+        self._disconnects = self.connection.disconnects
 
     def _decode_matching(self, parts: list[bytes]) -> wire.Message | None:
         """Decode a message, None unless it matches a pattern, is valid and new."""
         self._note_reception()
         topic = parts[0].decode("utf-8", "replace") if parts else ""
-        if topic == "service" and not self._is_checked:
+        if topic == "service":
             self._check_names(parts)
         if not any(_topic_matches(pattern, topic) for pattern in self.patterns):
             return None  # another topic under the same prefix, or the heartbeat
@@ -279,15 +273,14 @@ class Subscriber(AsyncClosing, Generic[M]):
         return message if is_new else None
 
     def _check_names(self, parts: list[bytes]) -> None:
-        """Let receiving raise UnknownNameError if a pattern matches nothing that the daemon has."""
+        """Raise UnknownNameError if a pattern matches nothing that the daemon has, by its `service`."""
         try:
             service = wire.decode(parts)
         except wire.WireError:
             return  # counted where it was subscribed
-        if isinstance(service, wire.Service):
-            self._is_checked = True
-            unknown = [text for pattern in self.patterns if (text := unknown_name(pattern, service.hands))]
-            self._unknown = UnknownNameError(unknown[0]) if unknown else None
+        for pattern in self.patterns:
+            if isinstance(service, wire.Service) and (text := unknown_name(pattern, service.hands)):
+                raise UnknownNameError(text)
 
 
 def columns(frame: wire.HandFrame | wire.Raw) -> dict[str, NDArray[Any]]:
