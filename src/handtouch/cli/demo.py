@@ -110,9 +110,7 @@ def run(
     logging.getLogger("canopen").setLevel(logging.CRITICAL)  # the master reports these errors itself
     with failing(2, ValueError):  # an error in a file, or an impossible grasp
         deployment = _with_palm_output(
-            _with_default_endpoints(
-                in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
-            )
+            in_process_deployment(load(config_path or shipped.path(DEFAULT_DEPLOYMENT)))
         )
         hidden = world_with(WORLDS[world], sheet=sheet, drift=drift).draw(seed)
         if scenario_path or hidden.world != WORLDS["ideal"]:
@@ -273,33 +271,12 @@ def in_process_deployment(deployment: Deployment) -> Deployment:
 
 
 def _open_daemon(deployment: Deployment, model: PadModel, folder: Path) -> HandtouchDaemon:
-    """Open the daemon; on free ports where another program has taken the default ones meanwhile."""
+    """Open the daemon on the default endpoints; where one is in use, on the deployment's free ports."""
+    by_default = deployment.model_copy(update={"daemon": deployment.daemon.model_copy(update=_ENDPOINTS)})
     try:
-        return HandtouchDaemon.open(deployment, model, folder=folder)
+        return HandtouchDaemon.open(by_default, model, folder=folder)
     except OSError:
-        if deployment.daemon.live != LIVE_ENDPOINT:
-            raise
-        settings = dict.fromkeys(_ENDPOINTS, "tcp://127.0.0.1:*")
-        daemon = deployment.daemon.model_copy(update=settings)
-        return HandtouchDaemon.open(deployment.model_copy(update={"daemon": daemon}), model, folder=folder)
-
-
-def _with_default_endpoints(deployment: Deployment) -> Deployment:
-    """Return the deployment with the default endpoints, if all of them are free."""
-    if not all(map(_is_free, _ENDPOINTS.values())):
-        return deployment
-    return deployment.model_copy(update={"daemon": deployment.daemon.model_copy(update=_ENDPOINTS)})
-
-
-def _is_free(endpoint: str) -> bool:
-    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, int(port)))
-        except OSError:
-            return False
-    return True
+        return HandtouchDaemon.open(deployment, model, folder=folder)
 
 
 def _endpoints_text(live: str) -> str:
