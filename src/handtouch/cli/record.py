@@ -26,7 +26,6 @@ from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
 
 NO_MESSAGE_TEXT = "no message received; is `handtouch run` running?"
-NO_FOXGLOVE_TEXT = f"without Foxglove's topics (/handtouch/...); for them: {extra_command('foxglove')}"
 _MAX_SHOWN_MINUTES = 600
 
 
@@ -78,7 +77,9 @@ def run(*, as_json: bool, **options: Any) -> int:
     with ProgressLine() as line:
         line.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
         if not capture.has_foxglove:
-            line.print_line(NO_FOXGLOVE_TEXT)
+            line.print_line(
+                f"without Foxglove's topics (/handtouch/...); for them: {extra_command('foxglove')}"
+            )
         with failing(1, PermissionError), capture:
             capture.run(stop, _RecordingProgress(capture, line).update)
         return _print_summary(capture, line, as_json)

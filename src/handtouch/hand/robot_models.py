@@ -46,7 +46,6 @@ _MAX_SURFACE_STEPS = 50
 _MIN_SLOPE = 0.1
 """A distance has slope 1, but where two places are equally near"""
 _MAX_PARALLEL = 0.9
-INSTALL_COMMAND = extra_command("urdf")
 
 
 class RobotModels:
@@ -160,7 +159,7 @@ def _why_unchecked(robot: RobotDescription, shapes: Sequence[urdf.BodyShape]) ->
     """Return why some mesh of a body isn't known; empty if all are."""
     meshes = [shape for shape in shapes if shape.kind == "mesh"]
     if meshes and not can_read_meshes():
-        return f"meshes are read with {INSTALL_COMMAND}"
+        return f"meshes are read with {extra_command('urdf')}"
     for mesh in meshes:
         path = find_mesh(mesh.file, robot.path.parent)
         why = f"file {mesh.file} not found" if path is None else unreadable_mesh(path, mesh.size_m)

@@ -14,9 +14,7 @@ from handtouch.simulate.grasp.patches import contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, simulate_grasp
 from handtouch.simulate.worlds import DrawnWorld
 
-INSTALL_COMMAND = extra_command("mujoco")
-
-__all__ = ["GRASP_OBJECTS", "INSTALL_COMMAND", "GraspRecord", "available", "grasp_stimulus", "simulate_grasp"]
+__all__ = ["GRASP_OBJECTS", "GraspRecord", "available", "grasp_stimulus", "simulate_grasp"]
 
 
 def available() -> bool:
@@ -33,7 +31,8 @@ def grasp_stimulus(
     """
     if not available():
         raise ValueError(
-            f"--grasp {object_name}: needs MuJoCo, which isn't installed by default: {INSTALL_COMMAND}"
+            f"--grasp {object_name}: needs MuJoCo, which isn't installed by default: "
+            + extra_command("mujoco")
         )
     if object_name not in GRASP_OBJECTS:
         raise ValueError(f"--grasp {object_name}: unknown object; known: {', '.join(GRASP_OBJECTS)}")
