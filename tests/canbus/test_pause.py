@@ -97,6 +97,10 @@ def test_pads_that_are_late_together_on_a_real_bus_name_the_host_and_then_the_ca
     rig.wire.lose = {0x281, 0x282, 0x283}
     events = rig.run(100)
     assert all("check the host's load, then this bus's cable" in event.reason for event in events)
+    rig.syncs = False
+    rig.wire.lose = set()
+    rig.run(1000)
+    assert "check its SYNC producer and cable" in rig.status(1).reason
 
 
 def test_pads_that_are_late_together_name_the_bus(rig: Any) -> None:

@@ -79,7 +79,8 @@ class BusCauses:
         if not self._sync_period_ns or silent_ns <= _MISSED_SYNC_PERIODS * self._sync_period_ns:
             return ""
         since = f" for {silent_ns / 1e6:.0f} ms" if port.last_sync_ns else " yet"
-        return f"no SYNC on bus {port.name}{since}; check its SYNC producer"
+        cable = "" if _is_simulated(port) else " and cable"
+        return f"no SYNC on bus {port.name}{since}; check its SYNC producer{cable}"
 
     def _describe_pause(self, silent_ns: int, now_ns: int) -> str:
         """Describe the loop's last pause if it ended within the silence and was a main part of it."""
@@ -90,4 +91,8 @@ class BusCauses:
 
 
 def _remedy(port: Port) -> str:
-    return _SIMULATED_REMEDY if port.bus.interface in CABLELESS_INTERFACES else _BUS_REMEDY
+    return _SIMULATED_REMEDY if _is_simulated(port) else _BUS_REMEDY
+
+
+def _is_simulated(port: Port) -> bool:
+    return port.bus.interface in CABLELESS_INTERFACES

@@ -277,10 +277,8 @@ class Master:
 
     def _handle_heartbeat(self, node: ManagedNode, nmt: int, now_ns: int) -> None:
         if nmt == cia301.BOOT_UP:
-            node.booted, node.heartbeat_window = (
-                True,
-                None,
-            )  # not configured yet: its heartbeat time is its default
+            node.booted = True
+            node.heartbeat_window = None  # not configured yet: its heartbeat time is its default
             self._advance(node, BootUpReceived(), now_ns)
             return
         node.heartbeats += 1

@@ -127,7 +127,11 @@ def on_slow_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Trans
     Its heartbeat time may have been changed: the settings are checked, and again at intervals.
     """
     life = life._replace(last_heartbeat_ns=now_ns, is_heartbeat_slow=True)
-    life = _with_heartbeat_reason(life, timing)
+    return _check_settings(_with_heartbeat_reason(life, timing), now_ns, timing)
+
+
+def _check_settings(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
+    """Let the settings be checked, unless they were a short time ago or aren't ours."""
     if timing.role is BusRole.LISTENER or now_ns - life.check_ns <= timing.max_retry_ns:
         return life, ()
     return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
@@ -138,10 +142,7 @@ def on_fast_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Trans
     every_ms, configured_ms = life.heartbeat_gap_ns / 1e6, timing.heartbeat_period_ns / 1e6
     text = f"every {every_ms:.0f} ms instead of {configured_ms:.0f} ms"
     remedy = f"set heartbeat_ms = {every_ms:.0f}, or the node's 0x1017"
-    life = life._replace(reason=f"{_FAST_HEARTBEAT}: {text}; {remedy}")
-    if now_ns - life.check_ns <= timing.max_retry_ns:
-        return life, ()
-    return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
+    return _check_settings(life._replace(reason=f"{_FAST_HEARTBEAT}: {text}; {remedy}"), now_ns, timing)
 
 
 def end_fast_heartbeat(life: Lifecycle) -> Lifecycle:
