@@ -101,8 +101,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         options = vars(build_parser().parse_args(arguments))
         command: Callable[..., int] = options.pop("command")
-        kind = options.pop("endpoint_kind", None)
-        if "daemon_config" in options:
+        if (kind := options.pop("endpoint_kind", None)) is not None:
             config = options.pop("daemon_config")
             with failing(2, ValueError, OSError):
                 options["endpoint"] = find_endpoint(kind, options["endpoint"], config)

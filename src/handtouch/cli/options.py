@@ -137,9 +137,9 @@ def add_endpoint(parser: argparse.ArgumentParser, kind: str, *, config: bool = T
     `kind`: a key of ENDPOINTS. `main` replaces the endpoint by `find_endpoint` before the command runs; a
     command with a deployment file of its own does so itself.
     """
-    parser.set_defaults(endpoint_kind=kind)
     default, text = ENDPOINTS[kind]
     if config:
+        parser.set_defaults(endpoint_kind=kind)
         parser.add_argument(
             "--config",
             dest="daemon_config",

@@ -33,7 +33,7 @@ _VERBOSE_COLUMNS = (
     ("id", True, lambda pad: str(pad["node_id"])),
     ("serial", True, lambda pad: "" if pad["serial"] is None else str(pad["serial"])),
     _RATE,
-    ("missed", True, lambda pad: f"{pad['missed_samples']}"),
+    ("missed", True, lambda pad: str(pad["missed_samples"])),
     ("heartbeats missed", True, lambda pad: str(pad["heartbeats_missed"])),
     ("reboots", True, lambda pad: str(pad["reboots"])),
     _REASON,
@@ -60,8 +60,11 @@ def run(*, endpoint: str, key: str | None, as_json: bool, verbose: bool) -> int:
 
 def is_all_ok(answer: dict[str, Any]) -> bool:
     """Return True if all pads are ok, and calibrations can be stored."""
-    supervisor = answer["service"].get("supervisor") or {}
-    return all(map(is_ok, answer["pads"])) and not supervisor.get("store_error")
+    return all(map(is_ok, answer["pads"])) and not _store_error(answer)
+
+
+def _store_error(answer: dict[str, Any]) -> str:
+    return str((answer["service"].get("supervisor") or {}).get("store_error", ""))
 
 
 def is_ok(pad: dict[str, Any]) -> bool:
@@ -100,7 +103,7 @@ def _verdict(answer: dict[str, Any]) -> str:
     return (
         f"{len(pads) - faulty.total()} of {len(pads)} pads ok{causes}, {service['rate_hz']:.0f} Hz"
         + (f", {buses}" if buses else "")
-        + ("; calibrations can't be stored" if (service.get("supervisor") or {}).get("store_error") else "")
+        + ("; calibrations can't be stored" if _store_error(answer) else "")
     )
 
 

@@ -60,6 +60,8 @@ class ConfigError(ValueError):
         self.problems = problems
 
 
+_NUMBER = r"[+-]?(0[xob][0-9a-fA-F]+|[\d_]*\.?\d+([eE][+-]?\d+)?)"
+"""A number as TOML has it"""
 _ENTRY = re.compile(r'\[\[[\w.]+\]\] (\d+)(?: "([^"]*)")?')
 """Location of an entry of a list, as `_locate` writes it: its number and name"""
 
@@ -152,10 +154,7 @@ class _ValidationMistake:
             remedy = str(self.error["msg"])
             for theirs, ours in _MESSAGE_REPLACEMENTS:
                 remedy = remedy.replace(theirs, ours)
-        given = self.error["input"]
-        if self.error_type in ("int_type", "float_type", "int_parsing", "float_parsing") and _is_number(
-            given
-        ):
+        if self.error_type in ("int_type", "float_type") and _is_number(given := self.error["input"]):
             remedy += f", without quotes: write {given}"
         if self.error_type == "tuple_type" and isinstance(self.error["input"], dict):
             return Problem(f"[{self.key}]", "", f"must be a list of tables: write [[{self.key}]]")
@@ -263,10 +262,7 @@ def _period_of_rate(key: str, value: object, known: Mapping[str, str]) -> str:
 
 
 def _is_number(value: object) -> bool:
-    try:
-        return isinstance(value, str) and (float(value) if "x" not in value else int(value, 0)) is not None
-    except ValueError:
-        return False
+    return isinstance(value, str) and re.fullmatch(_NUMBER, value) is not None
 
 
 def _without_unit(key: str) -> str:
