@@ -110,7 +110,9 @@ def test_a_subscription_to_a_link_that_the_daemon_has_after_a_restart_receives(
             contacts.recv(5)
         publisher.send_multipart(wire.encode(make_service(session=2)))
         publisher.send_multipart(wire.encode(make_contact("thumb_tip", "begin", 1, session=2)))
-        assert contacts.recv(5).link == "thumb_tip"
+        contact = contacts.recv(5)
+    assert contact is not None
+    assert contact.link == "thumb_tip"
 
 
 @pytest.fixture(autouse=True)
