@@ -15,7 +15,7 @@ import zmq
 import handtouch
 from handtouch import wire
 from handtouch.client import connection
-from handtouch.client.subscriber import unknown_name
+from handtouch.client.names import unknown_name
 from tests.client.hand_messages import make_contact, make_frame, make_service
 
 HANDS = {"right": ["thumb_tip", "index_tip"], "left": ["palm"]}

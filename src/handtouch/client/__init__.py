@@ -1,9 +1,9 @@
 """Client side: subscribe to a running daemon, send it requests and robot states, and manage keys."""
 
+from handtouch.client.names import UnknownNameError
 from handtouch.client.subscriber import (
     SERVICE_TIMEOUT_S,
     Subscriber,
-    UnknownNameError,
     columns,
     connect,
     request,

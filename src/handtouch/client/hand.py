@@ -28,13 +28,8 @@ from handtouch.client.daemon_clock import DaemonClock, age_limit_s
 from handtouch.client.hand_state import HandState
 from handtouch.client.link_columns import FrameName, HandArrays, LinkColumn, LinkColumns
 from handtouch.client.listener import Listener
-from handtouch.client.subscriber import (
-    SERVICE_TIMEOUT_S,
-    UnknownNameError,
-    connect,
-    request,
-    unknown_name,
-)
+from handtouch.client.names import UnknownNameError, unknown_name
+from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect, request
 from handtouch.client.wrench import Wrench
 from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT

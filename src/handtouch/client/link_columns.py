@@ -5,7 +5,6 @@ Public names: `LinkColumn`, `StatusColumn`, `TouchedColumn`, `NotSampledError`, 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -16,6 +15,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.client.names import link_hint
 from handtouch.client.wrench import (
     GraspMatrix,
     Wrench,
@@ -66,14 +66,12 @@ class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):
         try:
             return self._rows[link]
         except (KeyError, TypeError):
-            names = ", ".join(self._rows)
             if not isinstance(link, str):
+                names = ", ".join(self._rows)
                 raise TypeError(
                     f"{link!r} is no link; the links are {names}, and rows of numbers are in .array"
                 ) from None
-            close = difflib.get_close_matches(link, self._rows, 1)
-            hint = f"did you mean {close[0]!r}?" if close else f"the links are {names}"
-            raise KeyError(f"no link {link!r}; {hint}") from None
+            raise KeyError(f"no link {link!r}; {link_hint(link, self._rows)}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)

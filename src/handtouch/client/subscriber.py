@@ -4,16 +4,14 @@
         for contact in messages:
             print(contact.link, contact.event, contact.force_n)
 
-Public names: `connect`, `Subscriber`, `UnknownNameError`, `unknown_name`, `request`; `columns` reads a hand
-frame as arrays.
+Public names: `connect`, `Subscriber`, `request`; `columns` reads a hand frame as arrays.
 """
 
 from __future__ import annotations
 
 import asyncio
-import difflib
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
@@ -23,6 +21,7 @@ import zmq
 
 from handtouch import wire
 from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.client.names import UnknownNameError, topics_of_pattern, unknown_name
 from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
@@ -324,44 +323,9 @@ def request(
     return answer
 
 
-class UnknownNameError(LookupError):
-    """The daemon has no such hand or link; the text names those that it has."""
-
-
-def unknown_name(pattern: str, hands: Mapping[str, Sequence[str]]) -> str:
-    """Return why a pattern matches no topic of a daemon with these hands and their links; "" if it does."""
-    reasons = [
-        _unknown_key(dict(zip(topic.keys, parts, strict=True)), hands) for topic, parts in _rows(pattern)
-    ]
-    return "" if "" in reasons or not hands else reasons[0]
-
-
-def _unknown_key(keys: Mapping[str, str], hands: Mapping[str, Sequence[str]]) -> str:
-    hand, link = keys.get("hand", "*"), keys.get("link", "*")
-    named = [name for name in hands if fnmatchcase(name, hand)]
-    if not named:
-        return f"the daemon has no hand {hand!r}; it has {', '.join(hands)}"
-    links = [name for hand in named for name in hands[hand]]
-    if any(fnmatchcase(name, link) for name in links):
-        return ""
-    close = difflib.get_close_matches(link, links, 1)
-    hint = f"did you mean {close[0]!r}?" if close else f"the links are {', '.join(links)}"
-    return f"no link {link!r} on {', '.join(named)}; {hint}"
-
-
-def _rows(pattern: str) -> list[tuple[wire.Topic, list[str]]]:
-    """Return the topics that a pattern matches, and the parts for the keys of each."""
-    prefix, *parts = pattern.split("/")
-    return [
-        (topic, parts)
-        for topic in wire.TOPICS
-        if len(parts) == len(topic.keys) and fnmatchcase(topic.prefix, prefix)
-    ]
-
-
 def _check_pattern(pattern: str) -> list[type[Any]]:
     """Return the types of messages that a pattern matches. Raises ValueError if there is none."""
-    kinds: list[type[Any]] = [topic.payload for topic, _ in _rows(pattern)]
+    kinds: list[type[Any]] = [topic.payload for topic, _ in topics_of_pattern(pattern)]
     if not kinds:
         rows = ", ".join(topic.pattern for topic in wire.TOPICS)
         raise ValueError(f"no topic matches the pattern {pattern!r}; the topics are {rows}")
