@@ -7,6 +7,7 @@ not in real time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -243,9 +244,8 @@ def at_best(run: Served, touch: Touch) -> EventScore:
     events, period_s = EventScore(), _PER_TICK * TIME_STEP_S
     for pad, contacts in enumerate(run.spans):
         total = run.patches.total_n[::_PER_TICK, pad]
-        true = ideal_contact_spans(
-            total, period_s, touch.begin_threshold_n, touch.end_threshold_n, touch.begin_samples
-        )
+        samples = 1 + math.ceil(1e-3 * touch.begin_ms / period_s - 0.5)
+        true = ideal_contact_spans(total, period_s, touch.begin_threshold_n, touch.end_threshold_n, samples)
         compare_contacts(
             events, true, touch_spans(total, period_s, 0.0, 1e-9, 0.0), contacts, min_touch_s=0.0
         )

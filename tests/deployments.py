@@ -9,8 +9,8 @@ CYLINDER = '{ kind = "cylinder", radius_mm = 10.0, length_mm = 30.0, arc_deg = 1
 TOUCH = """
 begin_threshold_n = 0.1
 end_threshold_n = 0.05
-begin_samples = 2
-end_samples = 2
+begin_ms = 5.0
+end_ms = 5.0
 """
 EXACT_NODE = "gain_std = 0.0\nseries_std = 0.0\n"
 SHEET_TOLERANCES = (

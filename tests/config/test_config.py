@@ -245,6 +245,14 @@ ERRORS = {
         ("noise_counts = 1.0", 'noise_counts = 1.0\neds = "my.eds"'),
         '[node.four]: eds = "my.eds": no such file',
     ),
+    "samples for a time": (
+        ("end_threshold_n = 0.03", "end_threshold_n = 0.03\nbegin_samples = 3"),
+        "hand.toml: [touch]: begin_samples = 3: is begin_ms now: write begin_ms = 10 (begin_ms: a contact",
+    ),
+    "samples of a pad for a time, at another rate": (
+        ("gap_mm = 0.8\nmount", "gap_mm = 0.8\ntouch = { end_samples = 2 }\nmount"),
+        THUMB + "touch.end_samples = 2: is end_ms now: write end_ms = 5 (end_ms: a contact",
+    ),
     "thresholds the wrong way round": (
         ("end_threshold_n = 0.03", "end_threshold_n = 0.07"),
         "hand.toml: [touch]: end_threshold_n = 0.07: must be below begin_threshold_n = 0.06",
@@ -346,7 +354,7 @@ ERRORS = {
         "is given twice in {",
     ),
     "table twice": (
-        ("[[hand]]", "[touch]\nbegin_samples = 3\n[[hand]]"),
+        ("[[hand]]", "[touch]\nbegin_ms = 9.0\n[[hand]]"),
         "hand.toml: line 23 [touch]: this table is given twice, first on line 19; keep one",
     ),
     "byte order mark": (("\n[[bus]]", "\ufeff\n[[bus]]"), "line 1: its first character is a byte order mark"),

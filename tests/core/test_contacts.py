@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,19 +16,19 @@ BEGIN, END = 20.0, 10.0
 
 
 class Detector:
-    """Contacts of one pad with a baseline of 0 and 1 A per count."""
+    """Contacts of one pad with a baseline of 0 and 1 A per count; debounces of so many cycles' samples."""
 
-    def __init__(self, begin: int = 2, end: int = 3) -> None:
+    def __init__(self, begin: int = 2, end: int = 3, *, period_ns: int = 10) -> None:
         one, self._state, self._slab = np.ones(1), TickState.empty(1), Slab(1)
-        self._state.max_sample_period_ns[:] = 10
-        self._cycle, self._up = Cycle(10, 0.6), np.zeros(1, np.uint8)
-        counts = (np.array([number]) for number in (begin, end, 10))
+        self._state.max_sample_period_ns[:] = period_ns
+        self._cycle, self._up, self._period_ns = Cycle(period_ns, 0.6), np.zeros(1, np.uint8), period_ns
+        counts = (np.array([number]) for number in (10 * (begin - 1), 10 * (end - 1), 10))
         settings = DetectionSettings(np.ones((1, 4)), one, one, BEGIN * one, END * one, *counts)
         self.contacts = ContactDetector(settings, np.zeros((1, 4)), self._state)
 
     def step(self, level: float, sampled: bool = True, trusted: bool = True) -> ContactChanges:
-        """Run a cycle of 10 ns; a pad that isn't trusted is at the end of its range."""
-        self._cycle.begin_cycle(self._cycle.sync_ns + 10)
+        """Run a cycle; a pad that isn't trusted is at the end of its range."""
+        self._cycle.begin_cycle(self._cycle.sync_ns + self._period_ns)
         self._slab.begin_cycle(self._cycle.sync_ns)
         counts = np.array([level, 0, 0, 0] if trusted else [32767] * 4, dtype="<i2")
         if sampled or not trusted:
@@ -41,6 +42,17 @@ def test_a_contact_begins_after_the_debounce_with_the_time_of_its_first_sample()
     began = [len(detector.step(30).began) for _ in range(4)]
     assert began == [0, 0, 1, 0]
     assert detector.contacts.begin_ns[0] == 10
+
+
+@pytest.mark.parametrize(("period_ns", "samples"), [(1, 11), (2, 6), (9, 2), (11, 2), (40, 2)])
+def test_the_debounce_is_a_time_whatever_the_rate_and_at_least_two_samples(
+    period_ns: int, samples: int
+) -> None:
+    detector = Detector(begin=2, end=2, period_ns=period_ns)
+    began = [len(detector.step(30).began) for _ in range(samples)]
+    assert began == [0] * (samples - 1) + [1]
+    ended = [len(detector.step(0).ended) for _ in range(samples)]
+    assert ended == [0] * (samples - 1) + [1]
 
 
 def test_a_single_outlier_neither_begins_nor_ends_a_contact() -> None:

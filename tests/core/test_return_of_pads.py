@@ -13,7 +13,7 @@ from handtouch.wire import PadState
 from tests.record.conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand
 
 REST = b"\0" * 8
-SLOW_TO_BEGIN = DEPLOYMENT.replace("begin_samples = 2", "begin_samples = 4")
+SLOW_TO_BEGIN = DEPLOYMENT.replace("begin_ms = 5.0", "begin_ms = 15.0")
 
 
 def make_hand() -> Hand:

@@ -45,7 +45,7 @@ from handtouch.wire.health import Diagnosis
 from .conftest import DEPLOYMENT, PERIOD_NS, SESSION, CollectingSink, Hand, RecordingSession
 
 WITH_SHEETS = DEPLOYMENT.replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]")
-RELOADED = WITH_SHEETS.replace("end_samples = 2", "end_samples = 4").replace(
+RELOADED = WITH_SHEETS.replace("end_ms = 5.0", "end_ms = 15.0").replace(
     "gain_std = 0.2", "gain_std = 0.2\ncreep_time_s = 0.4"
 )
 TORN = Diagnosis(

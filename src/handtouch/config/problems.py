@@ -15,6 +15,8 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from handtouch.config.former_keys import replacement
+
 Tables = Mapping[str, type[BaseModel]]
 """Model of each table by its dotted path; "*" stands for a name chosen by the user."""
 
@@ -113,7 +115,7 @@ class _ValidationMistake:
         self.error_type: str = error["type"]
         self.is_scalar_union = loc[-1] in _SCALAR_TYPES if loc else False
         self.error = error
-        self.kinds = kinds
+        self.raw, self.kinds = raw, kinds
         path, self.section, self.key_path, self.table = _locate(
             raw, loc[:-1] if self.is_scalar_union else loc, kinds
         )
@@ -165,6 +167,11 @@ class _ValidationMistake:
         return Problem(self.location, value, remedy + self._key_description())
 
     def _unknown_key_problem(self, value: str) -> Problem:
+        if (found := replacement(self.key, self.error["input"], self.raw)) and self.section:
+            key, number = found
+            return Problem(
+                self.location, value, f"is {key} now: write {key} = {number:g}{self._key_description(key)}"
+            )
         if not self.section and isinstance(self.error["input"], dict | list):
             remedy = (
                 f"did you mean [{self.closest_key}]?"

@@ -402,11 +402,18 @@ class Touch(Table):
 
     begin_threshold_n: Positive = Field(0.06, description="a contact begins above this force")
     end_threshold_n: Positive = Field(0.03, description="a contact ends below this force")
-    begin_samples: int = Field(
-        2, ge=1, le=100, description="consecutive samples above begin_threshold_n that begin a contact"
+    begin_ms: float = Field(
+        5.0,
+        ge=0,
+        le=1000,
+        description="a contact begins once all samples have been above begin_threshold_n for so long, within "
+        "half a SYNC period; from two samples on, with 0 at the first",
     )
-    end_samples: int = Field(
-        2, ge=1, le=100, description="consecutive samples below end_threshold_n that end a contact"
+    end_ms: float = Field(
+        5.0,
+        ge=0,
+        le=1000,
+        description="a contact ends once all samples have been below end_threshold_n for so long, likewise",
     )
     max_gap_periods: int = Field(
         10,

@@ -32,9 +32,9 @@ class DetectionSettings(NamedTuple):
     """(n,) a contact begins above it"""
     end_threshold_a: FloatArray
     """(n,) a contact ends below it"""
-    begin_samples: NDArray[np.int64]
-    """(n,) successive samples"""
-    end_samples: NDArray[np.int64]
+    begin_debounce_ns: NDArray[np.int64]
+    """(n,) a contact begins once all samples have been above `begin_threshold_a` for so long"""
+    end_debounce_ns: NDArray[np.int64]
     max_gap_periods: NDArray[np.int64]
     """(n,) a contact ends after so many missing samples"""
 

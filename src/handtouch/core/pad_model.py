@@ -74,10 +74,10 @@ class PadModel:
     published; `position_unreliable` (n,).
 
     A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
-    `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_samples`,
-    `end_samples`: debounce; `max_gap_periods`: missing samples that a contact survives. `max_rise_time_s`: a
-    slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None where it isn't
-    modelled.
+    `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_debounce_ns`,
+    `end_debounce_ns`: times above and below them; `max_gap_periods`: missing samples that a contact survives.
+    `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None
+    where it isn't modelled.
 
     `crowding` (n,): pads on which currents crowd towards electrodes.
     `mounts` (n, MOUNT_COUNT): origins of the pads on their links, and their variances, see `ContactSolver`.
@@ -146,8 +146,8 @@ class PadModel:
         self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
         self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
         self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
-        self.begin_samples = np.array([touch.begin_samples for touch in touches])
-        self.end_samples = np.array([touch.end_samples for touch in touches])
+        self.begin_debounce_ns = np.array([round(1e6 * touch.begin_ms) for touch in touches])
+        self.end_debounce_ns = np.array([round(1e6 * touch.end_ms) for touch in touches])
         self.max_gap_periods = np.array([touch.max_gap_periods for touch in touches])
         self.max_rise_time_s = np.array([touch.max_rise_time_s for touch in touches])
         kinds_of_sheet = {name: _behaviour_of_sheet(sheet, name) for name, sheet in deployment.sheets.items()}

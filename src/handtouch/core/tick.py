@@ -292,6 +292,6 @@ class TickProcessor:
 def _detection_settings(model: PadModel) -> DetectionSettings:
     return DetectionSettings(
         *(model.ampere_per_count, model.mean_ampere_per_count, model.noise_counts),
-        *(model.begin_threshold_a, model.end_threshold_a, model.begin_samples),
-        *(model.end_samples, model.max_gap_periods),
+        *(model.begin_threshold_a, model.end_threshold_a, model.begin_debounce_ns),
+        *(model.end_debounce_ns, model.max_gap_periods),
     )

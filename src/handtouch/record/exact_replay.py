@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
+from handtouch.config.former_keys import replace_former_keys
 from handtouch.core.events import (
     DemandEvent,
     Event,
@@ -312,6 +313,7 @@ def recorded_deployment(payload: dict[str, Any]) -> Iterator[Deployment]:
         for name in [*named, *(hand.get("urdf") for hand in tables["hand"])]:  # never a file of this machine
             if name and Path(name).parent != Path(folder):
                 raise ValueError(f"the recording names the file {name!r}, but doesn't contain it")
+        replace_former_keys(tables)
         yield Deployment.model_validate_json(json.dumps(tables))
 
 

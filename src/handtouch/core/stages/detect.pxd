@@ -10,7 +10,7 @@ cdef class ContactDetection:
     cdef long long[::1] rows
     cdef double[::1] expected_counts, currents, ampere_per_count, noise_counts
     cdef double[::1] begin_threshold_a, end_threshold_a, mean_ampere_per_count, offset_std, offset_std_a
-    cdef long long[::1] begin_samples, end_samples, max_gap_periods
+    cdef long long[::1] begin_debounce_ns, end_debounce_ns, max_gap_periods
     cdef long long[::1] ticks, sample_ns, arrival_ns, sample_counts, missed_sample_counts, silent_ns
     cdef long long[::1] max_sample_period_ns
     cdef unsigned char[::1] pad_state, synchronous, touching, is_solved, position_requested, held
@@ -36,8 +36,8 @@ cdef void _check_sample(ContactDetection stage, SampleMemory memory, Py_ssize_t 
 @cython.locals(period_ns='long long')
 cdef void _check_silence(
     ContactDetection stage, Py_ssize_t pad, long long cycle_ns, long long half_period_ns) noexcept
-@cython.locals(level=double, touching=bint, above=bint, required='long long')
-cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad) noexcept
+@cython.locals(level=double, touching=bint, above=bint, debounce_ns='long long', elapsed_ns='long long')
+cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad, long long half_period_ns) noexcept
 @cython.locals(begin_a=double, end_a=double)
 cdef bint _is_above(ContactDetection stage, Py_ssize_t pad, double level, bint touching) noexcept
 @cython.locals(i=Py_ssize_t)

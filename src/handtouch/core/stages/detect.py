@@ -23,10 +23,10 @@ class ContactDetection:
     """Detection of contacts on n pads, at most one each.
 
     arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n c),
-    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), begin_samples,
-    end_samples and max_gap_periods (n,); expected_counts (n c) of untouched pads. Written for the solver:
-    currents (n c,), saturated (n c,), 1 for a channel at the top of its range, and offset_std_a (n,), the
-    standard deviation of the sums of the currents from the baseline [A].
+    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,),
+    begin_debounce_ns, end_debounce_ns and max_gap_periods (n,); expected_counts (n c) of untouched pads.
+    Written for the solver: currents (n c,), saturated (n c,), 1 for a channel at the top of its range, and
+    offset_std_a (n,), the standard deviation of the sums of the currents from the baseline [A].
     c is the number of electrodes of the pad that has most; those that a pad lacks have no current. Further
     channels of the slab are those of shear pads, whose currents never end: they are no part of a contact.
 
@@ -47,7 +47,7 @@ class ContactDetection:
         self.offset_std, self.offset_std_a = arrays["offset_std"], arrays["offset_std_a"]
         self.begin_threshold_a = arrays["begin_threshold_a"]
         self.end_threshold_a = arrays["end_threshold_a"]
-        self.begin_samples, self.end_samples = arrays["begin_samples"], arrays["end_samples"]
+        self.begin_debounce_ns, self.end_debounce_ns = arrays["begin_debounce_ns"], arrays["end_debounce_ns"]
         self.max_gap_periods = arrays["max_gap_periods"]
         # samples
         self.ticks = arrays["ticks"]
@@ -92,7 +92,7 @@ class ContactDetection:
             _check_silence(self, pad, sync_ns - previous_sync_ns, half_period_ns)
             if node_state[pad] != 0:
                 self.trusted = False
-            _detect_contact(self, pad)
+            _detect_contact(self, pad, half_period_ns)
             if node_state[pad] != 0:
                 self.pad_state[pad] = node_state[pad]
             elif self.stale:
@@ -193,8 +193,11 @@ def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period
         stage.trusted = False
 
 
-def _detect_contact(stage: ContactDetection, pad: int) -> None:
-    """Begin, continue or end a pad's contact; one on a pad that isn't trusted ends at once."""
+def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> None:
+    """Begin, continue or end a pad's contact; one on a pad that isn't trusted ends at once.
+
+    Times of SYNCs vary, so half a period less than the debounce is enough; one sample is not.
+    """
     level, touching = stage.total_current_a[pad], stage.touching[pad] != 0
     above = _is_above(stage, pad, level, touching)
     if touching and not stage.trusted:
@@ -203,10 +206,13 @@ def _detect_contact(stage: ContactDetection, pad: int) -> None:
         if stage.contradicting_samples[pad] == 0:
             stage.first_sample_ns[pad] = stage.sample_ns[pad]
         stage.contradicting_samples[pad] += 1
-        required = stage.end_samples[pad] if touching else stage.begin_samples[pad]
-        if stage.contradicting_samples[pad] >= required and touching:
+        debounce_ns = stage.end_debounce_ns[pad] if touching else stage.begin_debounce_ns[pad]
+        elapsed_ns = stage.sample_ns[pad] - stage.first_sample_ns[pad]
+        if stage.contradicting_samples[pad] > 1:
+            elapsed_ns += half_period_ns
+        if elapsed_ns >= debounce_ns and touching:
             _end_contact(stage, pad)
-        elif stage.contradicting_samples[pad] >= required:
+        elif elapsed_ns >= debounce_ns:
             _begin_contact(stage, pad)
     elif stage.sampled or not stage.trusted:
         stage.contradicting_samples[pad] = 0
