@@ -151,6 +151,23 @@ def test_heartbeat_slowed_by_another_client_is_repaired_once_the_node_answers(ma
     assert rig.status(1).reason == ""
 
 
+def test_every_change_of_a_heartbeat_time_is_repaired_soon_and_no_other_cause_is_named(
+    make_rig: Make,
+) -> None:
+    rig = make_rig(2)
+    rig.boot()
+    for heartbeat_ms in (1000, 0, 1000):
+        rig.node(1).write_object(0x1017, 0, heartbeat_ms)
+        reasons = {event.reason for event in rig.run(1400)}
+        assert rig.node(1).read_object(0x1017, 0) == 100, heartbeat_ms
+        expected = f"0x1017:00, heartbeat time, is {heartbeat_ms} instead of 100"
+        assert any(expected in reason for reason in reasons)
+        assert rig.status(1).reason == ""
+        for _ in range(20):
+            rig.run(50)
+            assert rig.status(1).reason == "", heartbeat_ms
+
+
 def test_nodes_that_boot_together_with_one_cob_id_are_both_faulted_and_neither_is_stale(
     make_rig: Make,
 ) -> None:

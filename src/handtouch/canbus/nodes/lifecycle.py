@@ -254,18 +254,23 @@ def _on_step_done(life: Lifecycle, event: StepDone, now_ns: int, timing: NodeTim
 def _start_node(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Start a configured node, or stop it in standby; its first samples are discarded.
 
-    A node found operational is started, too: it may have been made pre-operational to be configured.
+    A node found operational is started, too: it may have been made pre-operational to be configured. What was
+    measured of its heartbeats was before it was configured.
     """
+    life = life._replace(
+        last_heartbeat_ns=now_ns,
+        started_ns=now_ns,
+        heartbeat_ns=None,
+        heartbeat_gap_ns=0,
+        is_heartbeat_slow=False,
+    )
     if life.standby:
-        life = life._replace(last_heartbeat_ns=now_ns, started_ns=now_ns)
         return _on_standby_requested(enter(life, NodeState.SETTLING, now_ns, ""), True, now_ns, timing)
     running = life.nmt_state == cia301.OPERATIONAL
     ours = timing.role is BusRole.MASTER
     reason = "started" if ours else "configured; another master has to start it"
     life = enter(life, NodeState.SETTLING, now_ns, "already operational" if running else reason)
     life = life._replace(
-        last_heartbeat_ns=now_ns,
-        started_ns=now_ns,
         samples_to_discard=timing.settle_samples,
         foreign_nmt=None,
         confirmed=False,
@@ -287,7 +292,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
         return _repair_settings(life, event.reason, now_ns, timing)
     if event.step is NodeAction.CHECK_SETTINGS and life.is_heartbeat_slow:
         if event.timed_out:  # soon again
-            return life._replace(check_ns=now_ns + timing.retry_delay_ns(3) - timing.max_retry_ns), ()
+            return life._replace(check_ns=now_ns + timing.retry_delay_ns(3)), ()
         return _repair_settings(life, event.reason, now_ns, timing)
     if event.step is NodeAction.ENTER_STANDBY and life.state is NodeState.STOPPED:
         return enter(life, NodeState.STOPPED, now_ns, f"{_STANDBY_REASON}, but {event.reason}"), ()

@@ -132,9 +132,9 @@ def on_slow_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Trans
 
 def _check_settings(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Let the settings be checked, unless they were a short time ago or aren't ours."""
-    if timing.role is BusRole.LISTENER or now_ns - life.check_ns <= timing.max_retry_ns:
+    if timing.role is BusRole.LISTENER or now_ns < life.check_ns:
         return life, ()
-    return life._replace(check_ns=now_ns), (NodeAction.CHECK_SETTINGS,)
+    return life._replace(check_ns=now_ns + timing.max_retry_ns), (NodeAction.CHECK_SETTINGS,)
 
 
 def on_fast_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
@@ -158,7 +158,8 @@ def measure_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifec
         return life
     if 0 < gap_ns <= timing.heartbeat_timeout_ns:
         reason = "" if _SLOW_HEARTBEAT in life.reason else life.reason
-        return life._replace(is_heartbeat_slow=False, reason=reason)
+        check_ns = min(life.check_ns, now_ns + timing.retry_delay_ns(3))  # if it becomes slow again
+        return life._replace(is_heartbeat_slow=False, reason=reason, check_ns=check_ns)
     return _with_heartbeat_reason(life, timing)
 
 
