@@ -116,8 +116,7 @@ def _shown(scenario: Scenario, link: str) -> list[bool | None]:
 
 
 COLUMNS = (
-    "reads", "frames", "wrenches", "touches compared", "no processor", "unknown", "old, of a slow daemon",
-    "loops ended",
+    "reads", "frames", "wrenches", "touches compared", "no processor", "unknown", "loops ended",
 )  # fmt: skip
 
 
@@ -143,11 +142,7 @@ class Found:
 
 
 class HandCheck:
-    """Compares what a `Hand` shows with the truth.
-
-    `max_age_s`: limit of a frame's age by the stated periods. A daemon with too little processor time sends
-    frames less often, and the hand's own limit becomes longer: such older frames are counted apart.
-    """
+    """Compares what a `Hand` shows with the truth; `max_age_s`: limit of a frame's age."""
 
     def __init__(self, hand: Hand, truth: Truth, max_age_s: float, name: str = "Hand") -> None:
         self.hand, self.truth, self.found = hand, truth, Found(name)
@@ -162,24 +157,24 @@ class HandCheck:
 
     def look(self) -> bool:
         """Read the newest frame and check it; return True if there is one."""
-        before_ns, longest_s = time.monotonic_ns(), self.hand.max_age_s
+        before_ns = time.monotonic_ns()
         if before_ns - self._looked_ns > STARVED_NS:
             self._starved_ns = before_ns
         if before_ns - self._looked_ns > DELAYED_NS:
             self._delayed_ns = before_ns
         arrays = self.hand.latest()
         if arrays is not None:
-            self.check(arrays, before_ns, max(longest_s, self.hand.max_age_s))
+            self.check(arrays, before_ns)
         self._looked_ns = before_ns
         return arrays is not None
 
     def _is_starved(self, now_ns: int) -> bool:
         return now_ns - self._starved_ns < KNOWN_DEAD_NS
 
-    def check(self, arrays: HandArrays, before_ns: int, longest_s: float) -> None:
-        """Check a frame that was shown after `before_ns`, by the hand's limit of its age."""
+    def check(self, arrays: HandArrays, before_ns: int) -> None:
+        """Check a frame that was shown after `before_ns`."""
         self.found.checked["reads"] += 1
-        self._check_time(arrays, before_ns, longest_s)
+        self._check_time(arrays, before_ns)
         if arrays is self._checked:
             return
         self._checked = arrays
@@ -191,15 +186,14 @@ class HandCheck:
         if (link := next(self._next_link)) in arrays.links:
             self._check_force(link)
 
-    def _check_time(self, arrays: HandArrays, before_ns: int, longest_s: float) -> None:
+    def _check_time(self, arrays: HandArrays, before_ns: int) -> None:
         age_ns = before_ns - arrays.t_ns
         self.worst_age_s = max(self.worst_age_s, 1e-9 * age_ns)
-        self.found.checked["old, of a slow daemon"] += self._max_age_ns < age_ns
         died_ns = max(self.truth.deaths_ns, default=0)
         if arrays is self._violating:
             return
         violations = self.found.violations.total()
-        if age_ns > max(self._max_age_ns, 1e9 * longest_s):
+        if age_ns > self._max_age_ns:
             self.found.add("age", f"a frame of {1e-6 * age_ns:.1f} ms is shown")
         if arrays.t_ns > time.monotonic_ns() or min(self.hand.age_s.array) < 0:
             self.found.add("age", "a frame or a sample of the future is shown")

@@ -164,6 +164,7 @@ export function decodeFrame(payload: Uint8Array): Frame;
 /** What a client needs of `service`, the heartbeat. */
 export interface Service extends Envelope {
   period_s: number;
+  frame_period_s?: number;
   replay?: boolean;
 }
 

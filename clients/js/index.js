@@ -31,17 +31,12 @@ export class HandState {
   frameOrder = -1;
   /** True if the frames are of a replay, as `service` says. */
   isReplay = false;
+  /** Period of the hand's frames, as `service` states it; 0 before the first. */
+  periodNs = 0n;
   #contacts = new Map();
   #liveOrder = -1;
-  #servicePeriodNs = 0n;
-  #intervalsNs = [0n, 0n];
   #newestOrder = -1;
   #session = null;
-
-  /** What `service` and the frames say about the hand's period; 0 before. */
-  get periodNs() {
-    return max(this.#servicePeriodNs, min(...this.#intervalsNs));
-  }
 
   /** Active contacts by link: also without the message of an end, once a frame shows it. */
   get contacts() {
@@ -60,11 +55,6 @@ export class HandState {
 
   feedFrame(frame, order) {
     if (!this.#accept(frame.session, order) || frame.seq <= (this.frame?.seq ?? -1)) return;
-    if (this.frame !== null) {
-      // the shorter of two intervals, so that one late frame is no slower hand
-      const intervalNs = (frame.t_ns - this.frame.t_ns) / BigInt(frame.seq - this.frame.seq);
-      this.#intervalsNs = [this.#intervalsNs[1], intervalNs];
-    }
     this.frameOrder = order;
     if (!frame.retained) this.#liveOrder = order; // a retained one may be older than a contact before it
     this.frame = frame;
@@ -72,7 +62,7 @@ export class HandState {
 
   feedService(service, order) {
     if (!this.#accept(service.session, order)) return;
-    this.#servicePeriodNs = BigInt(Math.round(1e9 * service.period_s));
+    this.periodNs = BigInt(Math.round(1e9 * (service.frame_period_s ?? service.period_s)));
     this.isReplay = service.replay === true;
   }
 
@@ -82,8 +72,7 @@ export class HandState {
       if (order < this.#newestOrder) return false;
       this.frame = null;
       this.isReplay = false;
-      this.#servicePeriodNs = 0n;
-      this.#intervalsNs = [0n, 0n];
+      this.periodNs = 0n;
       this.#contacts.clear();
       this.#session = session;
     }

@@ -81,6 +81,7 @@ export function decodeContact(payload) {
 export function decodeService(payload) {
   const service = decodeMap(payload);
   if (typeof service.period_s !== "number") throw new WireError("service without period_s");
+  if (typeof (service.frame_period_s ?? 0) !== "number") throw new WireError("frame_period_s is no number");
   if (typeof service.hands !== "object" || service.hands === null) throw new WireError("service without hands");
   return service;
 }

@@ -242,13 +242,19 @@ class RelayedHand:
         network: Any = self.topics
         self.relay = RosRelay(network, make_stamper(), {"right": "palm"}, lambda: self.now_s)
 
-    def tick(self, *contacts: wire.Contact, state: Any = (0, 1, 0), contact_id: Any = (0, 7, 0)) -> None:
+    def tick(
+        self,
+        *contacts: wire.Contact,
+        state: Any = (0, 1, 0),
+        contact_id: Any = (0, 7, 0),
+        sample_ns: Any = None,
+    ) -> None:
         self.seq += 1
         self.now_s += 0.005
         for contact in contacts:
             self.relay.relay(replace(contact, seq=self.seq, t_ns=10**10 + 5_000_000 * self.seq))
         t_ns = 10**10 + 5_000_000 * self.seq
-        codes = {"state": state, "contact_id": contact_id, "sample_ns": (t_ns,) * 3}
+        codes = {"state": state, "contact_id": contact_id, "sample_ns": sample_ns or (t_ns,) * 3}
         self.relay.relay(make_frame(self.seq, t_ns=t_ns, **codes))
 
     def forces_n(self, name: str) -> list[float]:
@@ -313,6 +319,37 @@ def test_without_a_daemon_every_pad_is_unknown_once() -> None:
         second(hand.relay)
         for name in ("index_tip/", "thumb_tip/", "index_base/", ""):
             assert np.array_equal(hand.forces_n(name), [math.nan], equal_nan=True), name
+
+
+def test_a_pad_that_was_lost_is_known_again_by_a_newer_sample_only() -> None:
+    """Frames come again, of a hand whose pads haven't been sampled since they were lost."""
+    hand = RelayedHand()
+    hand.relay.relay(make_service())
+    hand.tick(HELD)
+    hand.now_s += 0.1
+    hand.relay.expire()
+    names = ("index_tip/", "thumb_tip/", "index_base/", "")
+    for name in names:
+        hand.forces_n(name)
+    old_ns = 10**10 + 5_000_000 * hand.seq
+    for state in ((0, 0, 0), (0, PadState.STALE, 0)):
+        hand.tick(state=state, contact_id=(0, 0, 0), sample_ns=(old_ns,) * 3)
+        assert [hand.forces_n(name) for name in names] == [[]] * 4
+    hand.tick(state=(0, 0, 0), contact_id=(0, 0, 0))
+    assert [hand.forces_n(name) for name in names] == [[0.0]] * 4
+
+
+def test_a_hand_is_silent_after_three_periods_of_its_frames_as_service_states_them() -> None:
+    """Not by their intervals, which grow with what a daemon is late by."""
+    hand = RelayedHand()
+    hand.relay.relay(make_service(frame_period_s=0.1))
+    hand.tick(HELD)
+    hand.now_s += 0.29
+    hand.relay.expire()
+    assert hand.forces_n("index_tip/") == [-2.0]
+    hand.now_s += 0.02
+    hand.relay.expire()
+    assert np.array_equal(hand.forces_n("index_tip/"), [math.nan], equal_nan=True)
 
 
 def test_markers_of_a_pad_that_falls_silent_are_a_grey_point_until_it_is_sampled() -> None:

@@ -1,4 +1,4 @@
-"""Log levels of node and bus events by severity."""
+"""Log levels of node and bus events by severity; `service` states how often frames come."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from handtouch import wire
 from handtouch.canbus.bus.bus_state import BusFault, BusState, ErrorState
+from handtouch.canbus.bus.router import BusCounters
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent, SerialChanged
 from handtouch.config import Behaviour
@@ -29,11 +31,16 @@ class Rig:
     def __init__(self, bench: Any) -> None:
         self.events: list[MasterEvent] = []
         self.bus_state = BusState()
+        self.sync = SimpleNamespace(period_ns=PERIOD_NS, overruns=0, report=lambda *_: {})
+        self.services: list[wire.Service] = []
         pipeline = self.pipeline = Pipeline(bench.model, PERIOD_NS, 0.6, self)
         master = SimpleNamespace(drain_events=self._drain, states=np.full(3, NodeState.OPERATIONAL))
-        port = SimpleNamespace(bus_state=self.bus_state, counters=SimpleNamespace(bits=0, overflow=0))
-        publisher = SimpleNamespace(has_subscriber=lambda _: False)
-        parts: tuple[Any, ...] = (pipeline, master, {"can0": port}, SimpleNamespace(), publisher)
+        port = SimpleNamespace(bus_state=self.bus_state, counters=BusCounters())
+        publisher = SimpleNamespace(
+            has_subscriber=lambda topic: topic == "service", send=self.services.append, session=1,
+            congestion_episodes={}, subscriptions=(),
+        )  # fmt: skip
+        parts: tuple[Any, ...] = (pipeline, master, {"can0": port}, self.sync, publisher)
         self.reporter = StatusReporter(
             bench.deployment,
             *parts,
@@ -51,8 +58,8 @@ class Rig:
     def send(self, _: object) -> None:
         raise AssertionError("no subscriber")
 
-    def poll(self) -> None:
-        self.now_ns += SECOND_NS
+    def poll(self, after_ns: int = SECOND_NS) -> None:
+        self.now_ns += after_ns
         self.reporter.poll(self.now_ns)
 
     def update_bus(self, fault: BusFault | None, queue_full: int = 0) -> None:
@@ -95,6 +102,27 @@ def test_node_events_are_logged_by_severity(
     assert "(h/plane): " in record.getMessage()
     assert record.getMessage().startswith("node 0x")
     assert "no heartbeat for 352 ms" in record.getMessage()
+
+
+def test_a_longer_period_of_frames_is_published_before_the_next_frame_is_late(rig: Rig) -> None:
+    rig.poll()
+    assert rig.services[-1].frame_period_s == pytest.approx(0.005)
+    for change in ("sync", "scene", "none"):
+        if change == "sync":
+            rig.sync.period_ns = 4 * PERIOD_NS
+        elif change == "scene":
+            rig.pipeline.state.ticks_per_hand_frame[0] = 10
+        before = len(rig.services)
+        rig.poll(1_000_000)
+        published = rig.services[before:]
+        expected = {"sync": [0.02], "scene": [0.2], "none": []}[change]
+        assert [service.frame_period_s for service in published] == pytest.approx(expected)
+    rig.sync.period_ns = PERIOD_NS  # a shorter one isn't urgent
+    before = len(rig.services)
+    rig.poll(1_000_000)
+    assert len(rig.services) == before
+    rig.poll()
+    assert rig.services[-1].frame_period_s == pytest.approx(0.05)
 
 
 def test_emcy_is_a_warning_and_its_clearing_information(rig: Rig, caplog: pytest.LogCaptureFixture) -> None:

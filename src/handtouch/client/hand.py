@@ -56,8 +56,8 @@ class Hand(LinkColumns, AsyncClosing):
     frame is older than `max_age_s`. A frame's age is by its own time, not by when it was received.
 
     `name`: the hand's in the deployment. `endpoint`, `control` and `key` as for `connect` and `request`.
-    `max_age_s`: None: three of the hand's periods, or MIN_AGE_LIMIT_S if that is longer. Frames of a replay,
-    whose `service` says so, have the age since their reception.
+    `max_age_s`: None: three of the periods of its frames as `service` states them, or MIN_AGE_LIMIT_S if that
+    is longer. Frames of a replay, whose `service` says so, have the age since their reception.
     Raises ValueError for an invalid name or endpoint and for an unusable key file; receiving raises
     PermissionError when the daemon rejects this client, and UnknownNameError while it has no hand of this
     name. Nothing received for 2 s is logged once, with the reason. Not thread-safe; callbacks have a thread
@@ -165,11 +165,8 @@ class Hand(LinkColumns, AsyncClosing):
 
     @property
     def max_age_s(self) -> float:
-        """Age [s] of the newest frame up to which it counts, of the present rate unless it was given."""
-        if self._given_age_s is not None:
-            return self._given_age_s
-        interval_s = min(1e-9 * self._state.frame_interval_ns, SERVICE_TIMEOUT_S / 3)
-        return age_limit_s(max(self._state.period_s, interval_s))
+        """Age [s] of the newest frame up to which it counts, of the planned rate unless it was given."""
+        return age_limit_s(self._state.period_s) if self._given_age_s is None else self._given_age_s
 
     @property
     def clock_uncertainty_s(self) -> float:

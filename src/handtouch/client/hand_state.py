@@ -21,18 +21,15 @@ class _OrderedContact(NamedTuple):
 class HandState:
     """Newest frame, contacts and service message of one hand; `feed` updates it.
 
-    `arrays`: None before the first frame of a session. `frame_interval_ns`: the shorter of the last two
-    intervals of frames, so that one that was late counts as no slower hand; 0 before the third.
+    `arrays`: None before the first frame of a session.
     """
 
     def __init__(self) -> None:
         self.arrays: HandArrays | None = None
         self.service: wire.Service | None = None
         self.period_s = 0.0
-        """of the hand, as `service` states it"""
+        """of the hand's frames, as `service` states it; 0 before the first"""
         self.is_replay = False
-        self.frame_interval_ns = 0
-        self._intervals_ns = 0, 0
         self.frame_order = self._newest_order = -1
         """number of the newest frame in the order of reception"""
         self._live_order = -1
@@ -51,16 +48,10 @@ class HandState:
                 return
             self.arrays, self.service, self.session = None, None, message.session
             self.period_s, self.is_replay = 0.0, False
-            self.frame_interval_ns, self._intervals_ns = 0, (0, 0)
             self._contacts.clear()
         self._newest_order = max(order, self._newest_order)
         match message:
             case wire.HandFrame() if self.arrays is None or message.seq > self.arrays.frame.seq:
-                if self.arrays is not None:
-                    before = self.arrays.frame
-                    interval_ns = (message.t_ns - before.t_ns) // (message.seq - before.seq)
-                    self._intervals_ns = self._intervals_ns[1], interval_ns
-                    self.frame_interval_ns = min(self._intervals_ns)
                 self.arrays = HandArrays(message, self._rows_of(message.links))
                 self.frame_order = order
                 if not message.retained:  # a retained one may be older than a contact received before
@@ -70,7 +61,8 @@ class HandState:
             case wire.Contact():
                 self._contacts[message.link] = _OrderedContact(order, message)
             case wire.Service():
-                self.service, self.period_s, self.is_replay = message, message.period_s, message.replay
+                self.service, self.is_replay = message, message.replay
+                self.period_s = message.frame_period_s or message.period_s
 
     @property
     def contacts(self) -> Mapping[str, wire.Contact]:

@@ -115,6 +115,7 @@ class StatusReporter:
         self._seq: NDArray[np.int64] = np.zeros(n, dtype=np.int64)
         self._core_compiled = Compilation.current().compiled
         self._service_seq = 0
+        self._published_frame_period_ns = 0
         self._service_window = _RateWindow(self._started_ns, self._totals())
         self._sample_rate_hz = np.zeros(n)
         self._rates_hz: dict[str, float] = {}
@@ -170,8 +171,17 @@ class StatusReporter:
             self._tick_durations_ns.clear()
             self._log_bus_problems()
             self._log_rejected_adaptation()
-            self._service_seq += 1
-            self._publish("service", partial(self._make_service, now_ns))
+            self._publish_service(now_ns)
+        elif self._frame_period_ns() > self._published_frame_period_ns:
+            self._publish_service(now_ns)  # before clients take the next frame for late
+
+    def _publish_service(self, now_ns: int) -> None:
+        self._service_seq += 1
+        self._published_frame_period_ns = self._frame_period_ns()
+        self._publish("service", partial(self._make_service, now_ns))
+
+    def _frame_period_ns(self) -> int:
+        return self._sync.period_ns * int(self._pipeline.state.ticks_per_hand_frame[0])
 
     def publish_stopping(self, now_ns: int) -> None:
         """Publish the last `service` message of the session."""
@@ -391,6 +401,7 @@ class StatusReporter:
             supervisor=self.supervisor.statistics() if self.supervisor is not None else None,
             percepts=self.percepts.statistics() if self.percepts is not None else None,
             inputs=self._input_statistics(now_ns),
+            frame_period_s=self._frame_period_ns() * 1e-9,
         )
 
     def _totals(self) -> NDArray[np.int64]:

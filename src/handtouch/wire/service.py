@@ -232,6 +232,9 @@ class Service:
     """statistics of the inputs endpoint"""
     replay: bool = False
     """true: `handtouch replay --publish` publishes it, so that the ages of all data are of their reception"""
+    frame_period_s: float = 0.0
+    """time between two `hand` frames as planned: `period_s`, or longer while the hand is idle or its scenes
+    ask for fewer; published at once when it grows. 0 or absent: `period_s`"""
     stopping: bool = False
     """true in the last message of a session, before contacts end and nodes are stopped; absent in the
     others"""

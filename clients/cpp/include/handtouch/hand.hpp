@@ -51,8 +51,8 @@ public:
     // The newest frame of the session, or nullptr.
     const Frame* frame() const { return frame_ ? &*frame_ : nullptr; }
 
-    // What `service` and the frames say about the hand's period; 0 before.
-    std::int64_t period_ns() const { return std::max(service_period_ns_, std::min(interval_ns_[0], interval_ns_[1])); }
+    // Period of the hand's frames, as `service` states it; 0 before the first.
+    std::int64_t period_ns() const { return period_ns_; }
     bool is_replay() const { return is_replay_; }
     // Number of the newest frame in the order of reception.
     std::int64_t frame_order() const { return frame_order_; }
@@ -79,10 +79,6 @@ public:
 
     void feed(Frame frame, std::int64_t order) {
         if (!accept(frame.session, order) || (frame_ && frame.seq <= frame_->seq)) return;
-        if (frame_) {  // the shorter of two intervals, so that one late frame is no slower hand
-            interval_ns_[0] = interval_ns_[1];
-            interval_ns_[1] = (frame.t_ns - frame_->t_ns) / (frame.seq - frame_->seq);
-        }
         frame_order_ = order;
         if (!frame.retained) live_order_ = order;  // a retained one may be older than a contact before it
         frame_ = std::move(frame);
@@ -90,7 +86,7 @@ public:
 
     void feed(const Service& service, std::int64_t order) {
         if (!accept(service.session, order)) return;
-        service_period_ns_ = static_cast<std::int64_t>(1e9 * service.period_s);
+        period_ns_ = static_cast<std::int64_t>(1e9 * service.frame_period_s);
         is_replay_ = service.replay;
     }
 
@@ -106,7 +102,7 @@ private:
             if (order < newest_order_) return false;
             frame_.reset();
             contacts_.clear();
-            service_period_ns_ = interval_ns_[0] = interval_ns_[1] = 0;
+            period_ns_ = 0;
             is_replay_ = false;
             session_ = session;
         }
@@ -124,7 +120,7 @@ private:
     std::optional<Frame> frame_;
     std::map<std::string, Entry> contacts_;
     std::int64_t frame_order_ = -1, live_order_ = -1, newest_order_ = -1, session_ = -1;
-    std::int64_t service_period_ns_ = 0, interval_ns_[2] = {0, 0};
+    std::int64_t period_ns_ = 0;
     bool is_replay_ = false;
 };
 

@@ -189,7 +189,7 @@ inline Value decode_payload(std::string_view payload) {
 // What a client needs of `service`, the heartbeat.
 struct Service {
     std::int64_t session = 0, t_ns = 0;
-    double period_s = 0.0;
+    double period_s = 0.0, frame_period_s = 0.0;
     bool retained = false, replay = false;
     std::vector<std::string> hands;
 };
@@ -199,7 +199,8 @@ inline Service decode_service(std::string_view payload) {
     Service made;
     made.session = map.at("session").as_int();
     made.t_ns = map.at("t_ns").as_int();
-    made.period_s = map.at("period_s").as_double();
+    made.period_s = made.frame_period_s = map.at("period_s").as_double();
+    if (const Value* period_s = map.find("frame_period_s")) made.frame_period_s = period_s->as_double();
     made.retained = map.at("retained").as_bool();
     if (const Value* replay = map.find("replay")) made.replay = replay->as_bool();
     const Value& hands = map.at("hands");  // name, links, name, links, ...

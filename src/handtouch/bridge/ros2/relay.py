@@ -19,9 +19,8 @@ from handtouch.bridge.ros2.conflation import Conflation
 from handtouch.bridge.ros2.conversion import Stamper
 from handtouch.bridge.ros2.network import Quality, RosNetwork, RosWriter, ros_name
 from handtouch.client import Subscriber
-from handtouch.client.daemon_clock import MIN_AGE_LIMIT_S
+from handtouch.client.daemon_clock import MIN_AGE_LIMIT_S, age_limit_s
 from handtouch.client.robot import Robot
-from handtouch.wire.status import MAX_SILENT_PERIODS
 
 TOPICS = ("contact/*/*", "hand/*", "health/*/*", "service")
 """Topics of the daemon that are relayed"""
@@ -29,8 +28,6 @@ _DIAGNOSTICS_PERIOD_NS = 1_000_000_000
 _MARKER_PERIOD_NS = 33_000_000
 _MAX_JOINT_STATES_PER_POLL = 32
 _MAX_MESSAGES_PER_ROUND = 2000
-MIN_SILENCE_S = MIN_AGE_LIMIT_S
-"""A hand is unknown after this time without a frame, or three periods if that is longer."""
 _COLUMNS = wire.COLUMNS[wire.HandFrame]
 _CLEAR, _TOUCHED = int(wire.PadState.CLEAR), int(wire.PadState.TOUCHED)
 _log = logging.getLogger("handtouch.bridge")
@@ -118,9 +115,12 @@ class RosRelay:
             self._session, self._newest_ns, self._sent_ns = service.session, 0, 0
             self._dropped_inputs = 0
             self._statuses.clear()
+            for known in self._hands.values():
+                known.forget_losses()
             _log.info("daemon %s connected, hands: %s", service.version, ", ".join(service.hands))
         for hand in service.hands:
             self._hand(hand).links = tuple(service.hands[hand])
+            self._hand(hand).longest_silence_s = age_limit_s(service.frame_period_s or service.period_s)
         self._update_status(conversion.daemon_status(service))
         for name, bus in service.buses.items():
             self._update_status(conversion.bus_status(name, bus))
@@ -194,6 +194,7 @@ class _HandRelay:
 
     def __init__(self, name: str, palm_link: str, network: RosNetwork, stamper: Stamper) -> None:
         self.links: tuple[str, ...] = ()
+        self.longest_silence_s = MIN_AGE_LIMIT_S
         self._name, self._palm_link, self._stamper, self._network = name, palm_link, stamper, network
         self._root = ros_name(name)
         self._contacts = network.writer(f"{self._root}/contacts", ros.ContactArray, Quality.STREAM)
@@ -202,11 +203,11 @@ class _HandRelay:
         self._tick_contacts: list[wire.Contact] = []
         self._active: dict[str, wire.Contact] = {}
         self._known_ns: dict[str, int] = {}  # links whose last wrench isn't NaN -> time of its sample
+        self._lost_ns: dict[str, int] = {}  # links whose wrench was NaN -> newest sample, unknown by now
         self._sum_ns: int | None = None  # time of the sum, None once it is unknown
         self._shown: dict[str, tuple[wire.Contact, bool]] = {}  # link with markers -> its contact, unknown
         self._unknown: dict[str, wire.Contact] = {}  # contacts that were lost sight of
         self._marked_ns = self._t_ns = 0
-        self._tick = self._period_ns = 0
         self._received_s: float | None = None
 
     def add_contact(self, contact: wire.Contact) -> None:
@@ -214,6 +215,7 @@ class _HandRelay:
         self._tick_contacts.append(contact)
         link = contact.link
         is_known = contact.end_reason == "released" if contact.event == "end" else contact.fresh
+        is_known = is_known and contact.t_ns > self._lost_ns.get(link, -1)
         if not is_known and (contact.event != "end" or link in self._active):
             self._unknown[link] = contact
         if contact.event == "end":
@@ -232,9 +234,7 @@ class _HandRelay:
         """Publish the contacts of the tick whose frame this is, which follows them."""
         contacts, self._tick_contacts = self._tick_contacts, []
         self.links = frame.links
-        if frame.tick > self._tick:
-            self._period_ns = (frame.t_ns - self._t_ns) // (frame.tick - self._tick) if self._t_ns else 0
-        self._tick, self._t_ns, self._received_s = frame.tick, frame.t_ns, received_s
+        self._t_ns, self._received_s = frame.t_ns, received_s
         if self._contacts.is_read:
             self._contacts.write(conversion.encode_contacts(contacts, frame, self._palm_link, self._stamper))
         ids = self._update_pads(frame)
@@ -251,8 +251,11 @@ class _HandRelay:
             _COLUMNS[name].to_array(getattr(frame, name)).tolist()
             for name in ("state", "contact_id", "sample_ns")
         )
+        are_sampled = True
         for link, pad_state, t_ns in zip(frame.links, state, sample_ns, strict=True):
-            if pad_state not in (_CLEAR, _TOUCHED):
+            is_sampled = pad_state in (_CLEAR, _TOUCHED) and t_ns > self._lost_ns.get(link, -1)
+            are_sampled = are_sampled and is_sampled
+            if not is_sampled:
                 if link in self._active:
                     self._unknown[link] = self._active[link]
                 self._lose(link, t_ns)
@@ -261,14 +264,17 @@ class _HandRelay:
                 if link not in self._known_ns and (writer := self._writer_of(link)).is_read:
                     writer.write(conversion.encode_plain_wrench(t_ns, link, 0.0, self._stamper))
                 self._known_ns[link] = t_ns
-        if not all(pad_state in (_CLEAR, _TOUCHED) for pad_state in state):
+        if not are_sampled:
             return None
         return {link: id for link, id in zip(frame.links, contact_id, strict=True) if id}
 
     def is_silent(self, now_s: float) -> bool:
-        """Return True if there was no frame for three periods and MIN_SILENCE_S."""
-        longest_s = max(MIN_SILENCE_S, MAX_SILENT_PERIODS * 1e-9 * self._period_ns)
-        return self._received_s is not None and now_s - self._received_s > longest_s
+        """Return True if there was no frame for `longest_silence_s`."""
+        return self._received_s is not None and now_s - self._received_s > self.longest_silence_s
+
+    def forget_losses(self) -> None:
+        """Begin another session, whose clock may be another."""
+        self._lost_ns.clear()
 
     def lose_all(self) -> None:
         """Publish that everything is unknown: the daemon is disconnected or silent."""
@@ -283,8 +289,10 @@ class _HandRelay:
 
     def _lose(self, link: str, t_ns: int) -> None:
         """Publish once that the wrench of a link is unknown, since a sample of this time."""
-        if self._known_ns.pop(link, None) is None:
+        known_ns = self._known_ns.pop(link, None)
+        if known_ns is None:
             return
+        self._lost_ns[link] = known_ns
         frame = contact.frame if (contact := self._unknown.get(link)) else link
         self._writer_of(link).write(conversion.encode_plain_wrench(t_ns, frame, math.nan, self._stamper))
 
