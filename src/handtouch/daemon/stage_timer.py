@@ -43,7 +43,9 @@ class Histogram:
 
     def statistics(self) -> dict[str, Any]:
         """Return `sum_s`, and `counts` up to the last bucket in use: the k-th ends at 1.024 us * 2**k."""
-        used = max((k for k, count in enumerate(self.counts) if count), default=-1) + 1
+        used = _BUCKET_COUNT
+        while used and not self.counts[used - 1]:
+            used -= 1
         return {"sum_s": self.sum_ns * 1e-9, "counts": self.counts[:used]}
 
 
