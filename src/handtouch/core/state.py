@@ -252,6 +252,11 @@ class TickState:
         """Return the memory of the arrays by name, flat, as the stages take it."""
         return {name: view_memory(getattr(self, name)) for name, _ in _stored_fields()}
 
+    def number_of(self, name: str) -> int:
+        """Return the number of floats in the block before those of an array."""
+        start, _ = np.lib.array_utils.byte_bounds(self.block)
+        return int(np.lib.array_utils.byte_bounds(getattr(self, name))[0] - start) // 8
+
     def save(self) -> bytes:
         """Return the bytes of all arrays."""
         return self.block.tobytes()

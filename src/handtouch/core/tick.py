@@ -20,15 +20,26 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.shear import ShearForces, changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.publish import PUBLISHED_SLICES, PUBLISHED_VALUES, ContactColumns
+from handtouch.core.stages.publish import ContactColumns
 from handtouch.core.state import TickState
-from handtouch.wire import PadState
+from handtouch.wire import COLUMNS, HandFrame, PadState
 
 FloatArray = NDArray[np.float64]
 _TOUCHED = int(PadState.TOUCHED)
+_PUBLISHED = {
+    name: at
+    for name, at in VALUE_SLICES.items()
+    if name in COLUMNS[HandFrame] and COLUMNS[HandFrame][name].codes is None
+}
+"""Values of a contact that are columns of hand frames"""
+_ENDS = np.cumsum([0, *(at.stop - at.start for at in _PUBLISHED.values())]).tolist()
 _VALUE_COLUMNS = view_memory(
-    np.concatenate(
-        [[[at.start, at.stop - at.start]] * (at.stop - at.start) for at in PUBLISHED_SLICES.values()]
+    np.array(
+        [
+            (first, at.stop - at.start, place)
+            for first, at in zip(_ENDS, _PUBLISHED.values(), strict=False)
+            for place in range(at.start, at.stop)
+        ]
     )
 )
 
@@ -84,10 +95,10 @@ class PadColumns:
         values = state.values
         views = {name: values[:, columns] for name, columns in VALUE_SLICES.items()}
         n = len(values)
-        published = np.full(n * PUBLISHED_VALUES, np.nan, np.float32)
+        published = np.full(n * _ENDS[-1], np.nan, np.float32)
         columns = {
-            name: published[n * at.start : n * at.stop].reshape((n, -1)[: at.stop - at.start])
-            for name, at in PUBLISHED_SLICES.items()
+            name: published[n * first : n * end].reshape((n, -1)[: end - first])
+            for name, first, end in zip(_PUBLISHED, _ENDS, _ENDS[1:], strict=False)
         }
         return cls(
             state=state.pad_state,
@@ -269,9 +280,16 @@ class TickProcessor:
             *(self.state.parts, self.contacts.saturated, self.state.noise_squared),
         )
         self.output = ContactColumns(
-            *(model.size, self.state.memory, view_memory(model.position_unreliable), _VALUE_COLUMNS),
-            *(view_memory(columns.published_values), view_memory(columns.published["total_current_a"])),
-            *(view_memory(columns.position_status), view_memory(columns.force_status)),
+            model.size,
+            self.state.memory
+            | {
+                "position_unreliable": view_memory(model.position_unreliable),
+                "value_columns": _VALUE_COLUMNS,
+                "published": view_memory(columns.published_values),
+                "published_current_a": view_memory(columns.published["total_current_a"]),
+                "position_status": view_memory(columns.position_status),
+                "force_status": view_memory(columns.force_status),
+            },
         )
         self.shear = ShearForces(model.shear_pads, self.state, columns.position_status, columns.force_status)
         """force vectors of contacts above shear pads"""

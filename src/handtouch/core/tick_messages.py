@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, Field, fields
 from functools import partial
 from typing import Any, Protocol
 
@@ -20,7 +21,10 @@ from handtouch import wire
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
-from handtouch.core.stages.publish import WRITTEN_FIELDS, ContactEncoder
+from handtouch.core.stages.frames import FRAME_SLICES, FRAME_VALUES
+from handtouch.core.stages.publish import CONDITIONS, FIELD_KINDS, INTEGERS, ContactEncoder
+from handtouch.core.stages.solve import PART_COUNT, PART_SLICES, VALUE_SLICES
+from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor, TickResult
 from handtouch.core.transforms import ContactTransforms
 from handtouch.wire import ContactEvent, EndReason, ForceStatus, FrameStatus, PadState, PositionStatus
@@ -42,7 +46,48 @@ _TRUE, _FALSE = b"\xc3", b"\xc2"  # bytes of msgpack
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
 _MIN_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
-_PAD_TEXTS = 4  # the last is empty
+_KIND = {name: number for number, name in enumerate(FIELD_KINDS)}
+_CONDITION = {name: number for number, name in enumerate(CONDITIONS)}
+_NAMES: dict[str, tuple[str, ...]] = {
+    "event": _EVENTS,
+    "end_reason": _END_REASONS,
+    "position_status": tuple(status.text for status in PositionStatus),
+    "force_status": tuple(status.text for status in ForceStatus),
+    "palm_status": tuple(status.text for status in FrameStatus),
+    "base_status": tuple(status.text for status in FrameStatus),
+    "force_vector_status": tuple(status.text for status in ForceStatus),
+}
+"""Texts of a field by its number"""
+_TRUTHS, _DURATIONS = ("retained", "fresh"), ("duration_s", "age_s")
+_PAD_TEXTS = (
+    "hand", "link", "frame", "begin_threshold_n", "end_threshold_n", "calibration_id", "diagnoses",
+)  # fmt: skip
+"""Fields that change with a pad's calibration only"""
+_FRAME_FIELDS = {
+    frame + name: (frame.rstrip("_"), slice(first + at.start, first + at.stop))
+    for first, frame in ((0, "palm_"), (FRAME_VALUES, "base_"))
+    for name, at in FRAME_SLICES.items()
+}
+_PLACES = {
+    **{name: (frame, "palm_values", at) for name, (frame, at) in _FRAME_FIELDS.items()},
+    **{name: ("located", "values", VALUE_SLICES[name]) for name in ("position_m", "normal", "pad_m")},
+    "covariance_m2": ("located", "values", VALUE_SLICES["covariance_m2"]),
+    "mount_covariance_m2": ("located", "values", VALUE_SLICES["mount_covariance_m2"]),
+    "force_std_n": ("std", "values", VALUE_SLICES["force_std_n"]),
+    "joints_age_s": ("frames", "palm_values", slice(2 * FRAME_VALUES, 2 * FRAME_VALUES + 1)),
+    "uncompensated_force_n": ("modelled", "uncompensated_force_n", slice(0, 1)),
+    "force_vector_n": ("vector", "force_vector", slice(0, 3)),
+    "force_vector_covariance_n2": ("vector", "force_vector", slice(3, 12)),
+    "palm_force_vector_n": ("vector", "frame_force_vector", slice(0, 3)),
+    "base_force_vector_n": ("vector", "frame_force_vector", slice(3, 6)),
+}
+"""Numbers that are known under a condition: that, an array of the state, and their place in its rows. Others
+are those of the same name in VALUE_SLICES, or in the state."""
+_PART_PLACES = {
+    **{name: (f"part_{frame}", "part_frames", at) for name, (frame, at) in _FRAME_FIELDS.items()},
+    **{name: ("always", "parts", at) for name, at in PART_SLICES.items()},
+}
+_PART_STEPS = {"parts": PART_COUNT, "part_frames": 2 * FRAME_VALUES}
 _MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
 
@@ -280,10 +325,13 @@ class ContactMessageEncoder:
     def __init__(self, model: PadModel, tick: TickProcessor, session: int) -> None:
         self._model, self._tick = model, tick
         pack = self._pack = msgpack.Packer().pack
-        keys = [pack(name) for name in WRITTEN_FIELDS]
+        contact_fields = [field for field in fields(wire.Contact) if field.name not in ("v", "session")]
+        names = [name for field in contact_fields for name in _NAMES.get(field.name, ())]
+        keys = [pack(field.name) for field in (*contact_fields, *fields(wire.ContactPart))]
         keys[0] = pack("v") + pack(wire.SCHEMA_VERSION) + pack("session") + pack(session) + keys[0]
-        statuses = [status.text for kind in (PositionStatus, ForceStatus, FrameStatus) for status in kind]
-        self._texts = [*keys, *map(pack, (*_EVENTS, *statuses, *_END_REASONS))]
+        self._texts = [*keys, *map(pack, names)]
+        self._fields = len(contact_fields)
+        self._layout = _contact_layout(tick.state, contact_fields, len(keys))
         self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
         self._calibrations = list(model.calibrations)
         self._pad_texts = [text for pad in range(model.size) for text in self._texts_of(pad)]
@@ -296,48 +344,89 @@ class ContactMessageEncoder:
         calibration = self._model.calibrations[pad]
         if calibration is not self._calibrations[pad]:
             self._calibrations[pad] = calibration
-            self._pad_texts[_PAD_TEXTS * pad : _PAD_TEXTS * (pad + 1)] = self._texts_of(pad)
+            self._pad_texts[len(_PAD_TEXTS) * pad : len(_PAD_TEXTS) * (pad + 1)] = self._texts_of(pad)
             self._build_stage()
         size = self._stage.encode_contact(
             pad, _EVENTS.index(event), sync_ns, now_ns, _END_REASONS.index(end_reason), retained
         )
         return wire.EncodedMessage(self._topics[pad], bytes(self._message[:size]))
 
-    def _texts_of(self, pad: int) -> tuple[bytes, ...]:
-        """Return the packed fields of a pad that change with its calibration only, for the stage."""
+    def _texts_of(self, pad: int) -> list[bytes]:
+        """Return the packed fields of a pad that change with its calibration only, empty where absent."""
         model, calibration = self._model, self._model.calibrations[pad]
-        groups: tuple[dict[str, Any], ...] = (
-            {"hand": model.hands[pad], "link": model.links[pad], "frame": model.frame_links[pad]},
-            {
-                "begin_threshold_n": float(model.begin_threshold_n[pad]),
-                "end_threshold_n": float(model.end_threshold_n[pad]),
-                "calibration_id": calibration.calibration_id,
-            },
-            {"diagnoses": calibration.diagnoses} if calibration.diagnoses else {},
-            {},
-        )
-        return tuple(
-            b"".join(self._pack(item) for pair in group.items() for item in pair) for group in groups
-        )
+        values: dict[str, Any] = {
+            "hand": model.hands[pad],
+            "link": model.links[pad],
+            "frame": model.frame_links[pad],
+            "begin_threshold_n": float(model.begin_threshold_n[pad]),
+            "end_threshold_n": float(model.end_threshold_n[pad]),
+            "calibration_id": calibration.calibration_id,
+            "diagnoses": calibration.diagnoses,
+        }
+        return [
+            self._pack(name) + self._pack(values[name]) if values[name] != () else b"" for name in _PAD_TEXTS
+        ]
 
     def _build_stage(self) -> None:
         tick, number = self._tick, np.zeros(1)
-        ends = np.cumsum([0, *map(len, self._texts)])
-        pad_ends = np.cumsum([0, *map(len, self._pad_texts[:-1])])
-        longest = max(np.diff([*pad_ends[::_PAD_TEXTS], len(b"".join(self._pad_texts))]))
-        message = np.zeros(ends[-1] + longest + _MAX_VALUE_BYTES, np.uint8)
-        self._message = message.data
-        self._stage = ContactEncoder(
-            tick.state.memory,
-            *(view_memory(tick.columns.position_status), view_memory(tick.columns.force_status)),
-            view_memory(tick.sheet_force.modelled),
-            *(_text_memory(self._texts), view_memory(ends)),
-            *(_text_memory(self._pad_texts), view_memory(pad_ends)),
-            view_memory(number),
-            view_memory(number.view(np.uint8)),
-            self._message,
-            view_memory(np.zeros(9)),
-        )
+        ends, pad_ends = (np.cumsum([0, *map(len, texts)]) for texts in (self._texts, self._pad_texts))
+        longest = max(np.diff(pad_ends[:: len(_PAD_TEXTS)]))
+        self._message = np.zeros(ends[-1] + longest + _MAX_VALUE_BYTES, np.uint8).data
+        arrays = {
+            "layout": view_memory(self._layout),
+            "state": view_memory(tick.state.block.view("<f8")),
+            "position_status": view_memory(tick.columns.position_status),
+            "force_status": view_memory(tick.columns.force_status),
+            "has_sheet_model": view_memory(tick.sheet_force.modelled),
+            "texts": _text_memory(self._texts),
+            "text_ends": view_memory(ends),
+            "pad_texts": _text_memory(self._pad_texts),
+            "pad_text_ends": view_memory(pad_ends),
+            "number": view_memory(number),
+            "number_bytes": view_memory(number.view(np.uint8)),
+            "message": self._message,
+            "summed": view_memory(np.zeros(9)),
+            "integers": view_memory(np.zeros(len(INTEGERS), np.int64)),
+            "conditions": view_memory(np.zeros(len(CONDITIONS), np.uint8)),
+        }
+        self._stage = ContactEncoder(self._fields, len(_PAD_TEXTS), tick.state.memory | arrays)
+
+
+def _contact_layout(
+    state: TickState, contact_fields: Sequence[Field[Any]], first_name: int
+) -> NDArray[np.int64]:
+    """Return the rows of `ContactEncoder.layout`, as declared in `wire.Contact` and `ContactPart`.
+
+    `first_name`: number of the first name among the texts.
+    """
+    rows: list[tuple[int, ...]] = []
+    for field in contact_fields:
+        name, is_optional = field.name, int(field.default is not MISSING)
+        if name == "parts":
+            rows.append((_KIND["parts"], 0, 1, 0, 0, 0))
+        elif name in _PAD_TEXTS:
+            rows.append((_KIND["text"], 0, is_optional, 0, 0, _PAD_TEXTS.index(name)))
+        elif name in INTEGERS:
+            kind = "seconds" if name in _DURATIONS else "truth" if name in _TRUTHS else "integer"
+            kind, default = ("name" if name in _NAMES else kind), int(field.default is True)
+            rows.append((_KIND[kind], 0, is_optional, first_name, default, INTEGERS.index(name)))
+            first_name += len(_NAMES.get(name, ()))
+        else:
+            at = VALUE_SLICES.get(name)
+            plain = "always", name if at is None else "values", slice(0, 1) if at is None else at
+            rows.append(_number_row(state, name, is_optional, _PLACES.get(name, plain)))
+    for field in fields(wire.ContactPart):
+        absent = 0 if field.default is MISSING else 2
+        rows.append(_number_row(state, field.name, absent, _PART_PLACES[field.name]))
+    return np.array(rows, np.int64)
+
+
+def _number_row(state: TickState, name: str, absent: int, place: tuple[str, str, slice]) -> tuple[int, ...]:
+    condition, array, at = place
+    first, step, count = state.number_of(array), getattr(state, array)[0].size, at.stop - at.start
+    kind = "covariance" if name == "covariance_m2" else "numbers"
+    step = _PART_STEPS.get(array, step)
+    return _KIND[kind], _CONDITION[condition], absent, first + at.start, step, count if count > 1 else 0
 
 
 def _text_memory(texts: Sequence[bytes]) -> memoryview:

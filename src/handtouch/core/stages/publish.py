@@ -1,7 +1,7 @@
 """Output of a tick's contacts: columns with statuses, NaN where there is no value, and contact messages as
 msgpack, whose bytes are those of the codec of `handtouch.wire`.
 
-Public names: `ContactColumns`, `PUBLISHED_SLICES`, `PUBLISHED_VALUES`, `ContactEncoder`, `WRITTEN_FIELDS`.
+Public names: `ContactColumns`, `ContactEncoder`, `FIELD_KINDS`, `CONDITIONS`, `INTEGERS`.
 """
 
 from __future__ import annotations
@@ -10,100 +10,68 @@ from collections.abc import Mapping
 from typing import Any
 
 from handtouch.core.stages.force import BOUNDED, WIDE
-from handtouch.core.stages.frames import FRAME_VALUES, PART_FRAMES
-from handtouch.core.stages.solve import (
-    MAX_SQUARED_MISFIT,
-    PART_COUNT,
-    PART_SLICES,
-    PARTS_COUNT,
-    VALUE_COUNT,
-    VALUE_SLICES,
-)
+from handtouch.core.stages.frames import FRAME_VALUES
+from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
 from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
 
-_VALUES, _FIRST = VALUE_COUNT, VALUE_SLICES["pad_m"].start
-_COUNT = VALUE_SLICES["mount_covariance_m2"].stop - _FIRST
-PUBLISHED_VALUES = _COUNT
-PUBLISHED_SLICES = {
-    name: slice(columns.start - _FIRST, columns.stop - _FIRST)
-    for name, columns in VALUE_SLICES.items()
-    if _FIRST <= columns.start < _FIRST + _COUNT
-}
-"""Values of a contact that are published: name -> numbers of its values. The columns are one behind another
-in this order, each (n, values)."""
-_POSITION, _FORCE = VALUE_SLICES["position_m"].start, VALUE_SLICES["force_n"].start
-_FORCE_STD, _ESTIMATE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["force_status"].start
-_MISFIT, _MAX_SQUARED_MISFIT = VALUE_SLICES["squared_misfit"].start, MAX_SQUARED_MISFIT
-_IS_BOUND = VALUE_SLICES["is_bound"].start
+_VALUES = VALUE_COUNT
+_PAD_M, _POSITION, _NORMAL = (VALUE_SLICES[name].start for name in ("pad_m", "position_m", "normal"))
+_COVARIANCE, _MOUNT = VALUE_SLICES["covariance_m2"].start, VALUE_SLICES["mount_covariance_m2"].start
+_FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
+_ESTIMATE, _MISFIT = VALUE_SLICES["force_status"].start, VALUE_SLICES["squared_misfit"].start
+_IS_BOUND, _MAX_SQUARED_MISFIT = VALUE_SLICES["is_bound"].start, MAX_SQUARED_MISFIT
 _BOUNDED_ESTIMATE, _WIDE_ESTIMATE = float(BOUNDED), float(WIDE)
 _NAN, _INFINITY = float("nan"), float("inf")
 _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = map(int, PositionStatus)
 _NOT_COMPUTED, _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID = map(int, ForceStatus)
 _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
-WRITTEN_FIELDS = (
-    *("seq", "t_ns", "event", "id", "begin_ns", "duration_s", "age_s", "position_m", "normal"),
-    *("covariance_m2", "pad_m", "position_status", "force_n", "force_std_n", "peak_force_n", "force_status"),
-    *("total_current_a", "residual", "residual_std", "end_reason", "retained", "group"),
-    *("palm_status", "palm_position_m", "palm_normal", "palm_covariance_m2"),
-    *("base_status", "base_position_m", "base_normal", "base_covariance_m2"),
-    *("joints_age_s", "uncompensated_force_n", "fresh", "force_vector_status", "force_vector_n"),
-    *("force_vector_covariance_n2", "palm_force_vector_n", "base_force_vector_n", "parts"),
-    "mount_covariance_m2",
-)
-"""Fields in the order in which they are written; the others are texts of the pad."""
-_PALM_VALUES, _PAD_M = 2 * FRAME_VALUES + 1, VALUE_SLICES["pad_m"].start
-_NORMAL, _COVARIANCE = VALUE_SLICES["normal"].start, VALUE_SLICES["covariance_m2"].start
-_MOUNT = VALUE_SLICES["mount_covariance_m2"].start
-_RESIDUAL, _RESIDUAL_STD = VALUE_SLICES["residual"].start, VALUE_SLICES["residual_std"].start
-_BASE, _AGE = FRAME_VALUES, 2 * FRAME_VALUES  # in the values of a contact in palm and base
-_VECTOR, _FRAME_VECTORS = 12, 6  # force vector with its covariance; in palm and base
-_END = 2  # number of the event
-_PART_COUNT, _PARTS_COUNT, _PART_COVARIANCE = PART_COUNT, PARTS_COUNT, PART_SLICES["covariance_m2"].start
-_PART_FORCE = PART_SLICES["force_n"].start
-_PART_FRAMES = PART_FRAMES
-_KEY_POSITION, _KEY_NORMAL = WRITTEN_FIELDS.index("position_m"), WRITTEN_FIELDS.index("normal")
-_KEY_COVARIANCE, _KEY_FORCE = WRITTEN_FIELDS.index("covariance_m2"), WRITTEN_FIELDS.index("force_n")
-_KEY_FORCE_STD, _KEY_PARTS = WRITTEN_FIELDS.index("force_std_n"), WRITTEN_FIELDS.index("parts")
-_KEY_MOUNT = WRITTEN_FIELDS.index("mount_covariance_m2")
-_KEY_PALM, _KEY_BASE = WRITTEN_FIELDS.index("palm_position_m"), WRITTEN_FIELDS.index("base_position_m")
-_EVENTS = len(WRITTEN_FIELDS)  # first of the names of events, statuses and reasons
-_POSITION_STATUSES, _FORCE_STATUSES, _FRAME_STATUSES, _REASONS = (
-    _EVENTS + 3,
-    _EVENTS + 7,
-    _EVENTS + 12,
-    _EVENTS + 16,
-)
-_REQUIRED, _HEADER_BYTES = 29, 3
-_PAD_TEXTS = 4
 _FRAME_VALID = int(FrameStatus.VALID)
+_END = 2  # number of the event
+_HEADER_BYTES, _ROW_COUNT, _VALUE_NUMBERS = 3, 6, 3
+_FRAME_VALUES, _PART_FRAMES = FRAME_VALUES, 2 * FRAME_VALUES
+_PARTS_COUNT = PARTS_COUNT
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9
+
+FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "text", "parts"
+"""How a field is written: four kinds from one of INTEGERS; from the memory of the state; as that, plus the
+covariance of the mount; as a text of the pad; as the two contacts of a pad."""
+_INTEGER, _SECONDS, _NAME, _TRUTH, _NUMBERS, _SUM, _TEXT, _PARTS = range(len(FIELD_KINDS))
+CONDITIONS = (
+    "always", "located", "std", "frames", "palm", "base", "modelled", "vector", "part_palm", "part_base",
+)  # fmt: skip
+"""What a contact must have for a field of numbers not to be nil or absent: a position; the standard deviation
+of its force; requested frames; a position in the palm; in the base; a sheet with a model; a force vector; of
+one of two contacts, a position in the palm; in the base."""
+_ALWAYS, _LOCATED, _STD, _FRAMES, _PALM, _BASE, _MODELLED, _VECTOR, _PART_PALM, _PART_BASE = range(
+    len(CONDITIONS)
+)
+INTEGERS = (
+    "seq", "t_ns", "event", "id", "begin_ns", "position_status", "force_status", "end_reason", "retained",
+    "group", "palm_status", "base_status", "fresh", "force_vector_status", "duration_s", "age_s",
+)  # fmt: skip
+"""Integers, truth values, numbers of names, and durations in nanoseconds."""
+(
+    _SEQ, _T, _EVENT, _ID, _BEGIN, _POSITION_STATUS, _FORCE_STATUS, _REASON, _RETAINED,
+    _GROUP, _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE,
+) = range(len(INTEGERS))  # fmt: skip
 
 
 class ContactColumns:
     """Columns of n pads. arrays: flat memory of the arrays of `TickState` by their names.
 
-    position_unreliable: (n,) of the model. value_columns: (2 PUBLISHED_VALUES,) of each value, values before
-    its column, and of its column. Written: published (n PUBLISHED_VALUES,), total_current_a, position_status
-    and force_status (n,).
+    Among them are also position_unreliable, (n,) of the model; value_columns, (3 m,) of each of m published
+    values the number of those before its column, that of its column, and its place in a row of values; and
+    what is written: published (n m,), published_current_a, position_status and force_status (n,).
     """
 
-    def __init__(
-        self,
-        pads: int,
-        arrays: Mapping[str, Any],
-        position_unreliable: memoryview[int],
-        value_columns: memoryview[int],
-        published: memoryview[float],
-        total_current_a: memoryview[float],
-        position_status: memoryview[int],
-        force_status: memoryview[int],
-    ) -> None:
-        self.pads, self.position_unreliable = pads, position_unreliable
-        self.value_columns = value_columns
-        self.published, self.published_current_a = published, total_current_a
+    def __init__(self, pads: int, arrays: Mapping[str, Any]) -> None:
+        self.pads, self.position_unreliable = pads, arrays["position_unreliable"]
+        self.value_columns = arrays["value_columns"]
+        self.count = len(self.value_columns) // _VALUE_NUMBERS
+        self.published, self.published_current_a = arrays["published"], arrays["published_current_a"]
         self.total_current_a = arrays["total_current_a"]
-        self.position_status, self.force_status = position_status, force_status
+        self.position_status, self.force_status = arrays["position_status"], arrays["force_status"]
         self.contact_id, self.solved, self.values = arrays["contact_id"], arrays["solved"], arrays["values"]
         self.position_requested = arrays["position_requested"]
         self.force_requested = arrays["force_requested"]
@@ -131,13 +99,14 @@ class ContactColumns:
                 _publish_contact(self, pad)
             elif self.position_status[pad] != _NOT_COMPUTED or self.force_status[pad] != _NOT_COMPUTED:
                 self.position_status[pad] = self.force_status[pad] = _NOT_COMPUTED
-                for i in range(_COUNT):
+                for i in range(self.count):
                     self.published[_published_index(self, pad, i)] = _NAN
 
 
 def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
     """Return the position of a pad's value i in the published columns."""
-    before, width = columns.value_columns[2 * i], columns.value_columns[2 * i + 1]
+    before = columns.value_columns[_VALUE_NUMBERS * i]
+    width = columns.value_columns[_VALUE_NUMBERS * i + 1]
     return columns.pads * before + pad * width + i - before
 
 
@@ -153,14 +122,15 @@ def _are_finite(values: memoryview[float], first: int, count: int) -> bool:
 def _publish_contact(columns: ContactColumns, pad: int) -> None:
     values, first = columns.values, pad * _VALUES
     has_mount = _are_finite(values, first + _MOUNT, 9)
-    for i in range(_COUNT):
-        value = values[first + _FIRST + i]
-        if has_mount and _COVARIANCE <= _FIRST + i < _COVARIANCE + 9:
-            value += values[first + _MOUNT + _FIRST + i - _COVARIANCE]
+    for i in range(columns.count):
+        at = columns.value_columns[_VALUE_NUMBERS * i + 2]
+        value = values[first + at]
+        if has_mount and _COVARIANCE <= at < _COVARIANCE + 9:
+            value += values[first + _MOUNT + at - _COVARIANCE]
         columns.published[_published_index(columns, pad, i)] = (
             value if -_INFINITY < value < _INFINITY else _NAN
         )
-    located = _are_finite(values, first + _FIRST, 2) and _are_finite(values, first + _POSITION, 6)
+    located = _are_finite(values, first + _PAD_M, 2) and _are_finite(values, first + _POSITION, 6)
     position = _POSITION_INVALID if columns.position_requested[pad] else _NOT_COMPUTED
     if located:
         no_point = values[first + _MISFIT] > _MAX_SQUARED_MISFIT or values[first + _IS_BOUND] != 0.0
@@ -188,49 +158,39 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
 class ContactEncoder:
     """Encoder of contact messages. arrays: flat memory of the arrays of `TickState` by their names.
 
-    position_status, force_status, has_sheet_model: (n,) of the pads. texts: packed keys of WRITTEN_FIELDS,
-    then names of events, of position, force and frame statuses, and end reasons; text_ends: (count + 1,)
-    where each begins, and the last ends. pad_texts: packed fields of each pad: hand to frame;
-    begin_threshold_n to calibration_id; diagnoses, empty if there are none; pad_text_ends: (4 n,) where each
-    begins, and the last of a pad ends. number: one, of which number_bytes is the memory. message: written.
-    summed: (9,), working memory.
+    Among them are also `state`, the memory of all of them as numbers; position_status, force_status,
+    has_sheet_model: (n,) of the pads; layout: (6 m,) of each field its number in FIELD_KINDS, that in
+    CONDITIONS, and 0 if it is always present, 1 if it is absent where it is unknown, 2 where its condition
+    isn't met; of numbers their first place in the state, the step from one pad to the next, and their count,
+    0 of a single number; of names the first, their default, and their number in INTEGERS. Behind the fields
+    of a contact are those of one of two contacts on a pad, with the step from one to the next; the number of
+    the former is `fields`. texts: packed keys of the fields, then names; text_ends: where each begins, and the
+    last ends. pad_texts: packed fields of the pads, with their keys; empty where one is absent. number: one,
+    of which number_bytes is the memory. message: written. summed (9,), integers and conditions: working
+    memory.
     """
 
-    def __init__(
-        self,
-        arrays: Mapping[str, Any],
-        position_status: memoryview[int],
-        force_status: memoryview[int],
-        has_sheet_model: memoryview[int],
-        texts: memoryview[int],
-        text_ends: memoryview[int],
-        pad_texts: memoryview[int],
-        pad_text_ends: memoryview[int],
-        number: memoryview[float],
-        number_bytes: memoryview[int],
-        message: memoryview[int],
-        summed: memoryview[float],
-    ) -> None:
-        self.summed = summed
-        self.position_status, self.force_status = position_status, force_status
-        self.has_sheet_model = has_sheet_model
-        self.texts, self.text_ends = texts, text_ends
-        self.number, self.number_bytes, self.message = number, number_bytes, message
+    def __init__(self, fields: int, pad_text_count: int, arrays: Mapping[str, Any]) -> None:
+        self.row_count, self.pad_text_count = fields, pad_text_count
+        self.layout, self.state, self.summed = arrays["layout"], arrays["state"], arrays["summed"]
+        self.integers, self.conditions = arrays["integers"], arrays["conditions"]
+        self.part_rows = len(self.layout) // _ROW_COUNT - fields
+        self.position_status, self.force_status = arrays["position_status"], arrays["force_status"]
+        self.has_sheet_model = arrays["has_sheet_model"]
+        self.texts, self.text_ends = arrays["texts"], arrays["text_ends"]
+        self.pad_texts, self.pad_text_ends = arrays["pad_texts"], arrays["pad_text_ends"]
+        self.number, self.number_bytes = arrays["number"], arrays["number_bytes"]
+        self.message = arrays["message"]
         self.contact_seq, self.contact_id = arrays["contact_seq"], arrays["contact_id"]
         self.sample_ns, self.begin_ns = arrays["sample_ns"], arrays["begin_ns"]
-        self.values, self.peak_force_n = arrays["values"], arrays["peak_force_n"]
-        self.total_current_a = arrays["total_current_a"]
-        self.uncompensated_force_n = arrays["uncompensated_force_n"]
+        self.values, self.group_id = arrays["values"], arrays["group_id"]
         self.silent_ns, self.synchronous = arrays["silent_ns"], arrays["synchronous"]
         self.max_sample_period_ns = arrays["max_sample_period_ns"]
         self.palm_requested, self.base_requested = arrays["palm_requested"], arrays["base_requested"]
         self.palm_status, self.base_status = arrays["palm_status"], arrays["base_status"]
-        self.palm_values, self.group_id = arrays["palm_values"], arrays["group_id"]
-        self.vector, self.vector_status = arrays["force_vector"], arrays["force_vector_status"]
-        self.frame_vector, self.parts = arrays["frame_force_vector"], arrays["parts"]
+        self.vector_status, self.parts = arrays["force_vector_status"], arrays["parts"]
         self.part_frames = arrays["part_frames"]
-        self.pad_texts, self.pad_text_ends = pad_texts, pad_text_ends
-        self.written = self.field = self.fields = 0
+        self.written = self.fields = 0
 
     def encode_contact(
         self, pad: int, event: int, sync_ns: int, now_ns: int, end_reason: int, retained: bool
@@ -240,146 +200,129 @@ class ContactEncoder:
         event: 0 begin, 1 update, 2 end. sync_ns: of the tick in which the contact ended. end_reason: number
         of its name.
         """
-        sample_ns, begin_ns = self.sample_ns[pad], self.begin_ns[pad]
+        sample_ns, begin_ns, integers = self.sample_ns[pad], self.begin_ns[pad], self.integers
         t_ns = sync_ns if event == _END else sample_ns
-        first, status = pad * _VALUES, self.force_status[pad]
-        located = _are_finite(self.values, first + _POSITION, 3) and _are_finite(
-            self.values, first + _NORMAL, 3
-        )
-        located = located and _are_finite(self.values, first + _PAD_M, 2)
-        self.written, self.field, self.fields = _HEADER_BYTES, 0, _REQUIRED
-        _write_integer(self, self.contact_seq[pad])
-        _write_integer(self, t_ns)
-        _write_name(self, _EVENTS + event)
-        _write_integer(self, self.contact_id[pad])
-        _write_pad_text(self, pad, 0)
-        _write_integer(self, begin_ns)
-        _write_number(self, (t_ns - begin_ns) * _SECONDS_PER_NS)
-        _write_number(self, (now_ns - sample_ns) * _SECONDS_PER_NS)
-        _write_array(self, self.values, first + _POSITION, 3, located)
-        _write_array(self, self.values, first + _NORMAL, 3, located)
-        _sum_covariance(self, self.values, first + _COVARIANCE, first + _MOUNT)
-        _write_array(self, self.summed, 0, 9, located)
-        _write_array(self, self.values, first + _PAD_M, 2, located)
-        _write_name(self, _POSITION_STATUSES + self.position_status[pad])
-        _write_number(self, self.values[first + _FORCE])
-        has_std = status in (_FORCE_VALID, _FORCE_UNRELIABLE)
-        _write_number(self, self.values[first + _FORCE_STD] if has_std else _INFINITY)
-        _write_number(self, self.peak_force_n[pad])
-        _write_name(self, _FORCE_STATUSES + status)
-        _write_number(self, self.total_current_a[pad])
-        _write_number(self, self.values[first + _RESIDUAL])
-        _write_number(self, self.values[first + _RESIDUAL_STD])
-        _write_pad_text(self, pad, 1)
-        _write_name(self, _REASONS + end_reason)
-        _write_truth(self, retained)
-        _write_frames(self, pad)
-        if self.has_sheet_model[pad]:
-            _write_optional_number(self, self.uncompensated_force_n[pad])
-        else:
-            self.field += 1
-        if self.pad_text_ends[pad * _PAD_TEXTS + 3] > self.pad_text_ends[pad * _PAD_TEXTS + 2]:
-            self.fields += 1
-            _write_pad_text(self, pad, 2)
-        max_silent_ns = 0 if self.synchronous[pad] else _MAX_SILENT_PERIODS * self.max_sample_period_ns[pad]
-        if self.silent_ns[pad] > max_silent_ns:
-            self.fields += 1
-            _write_truth(self, False)
-        else:
-            self.field += 1
-        if self.vector_status[pad] != _NOT_COMPUTED:
-            self.fields += 1
-            _write_name(self, _FORCE_STATUSES + self.vector_status[pad])
-            _write_optional_array(self, self.vector, _VECTOR * pad, 3)
-            _write_optional_array(self, self.vector, _VECTOR * pad + 3, 9)
-            _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad, 3)
-            _write_optional_array(self, self.frame_vector, _FRAME_VECTORS * pad + 3, 3)
-        if self.parts[_PARTS_COUNT * pad] == self.parts[_PARTS_COUNT * pad]:
-            self.fields += 1
-            _write_parts(self, pad)
-        if located:
-            self.field = _KEY_MOUNT
-            _write_optional_array(self, self.values, first + _MOUNT, 9)
+        integers[_SEQ], integers[_T], integers[_EVENT] = self.contact_seq[pad], t_ns, event
+        integers[_ID], integers[_BEGIN] = self.contact_id[pad], begin_ns
+        integers[_DURATION], integers[_AGE] = t_ns - begin_ns, now_ns - sample_ns
+        integers[_REASON], integers[_RETAINED] = end_reason, retained
+        integers[_FRESH] = _is_fresh(self, pad)
+        _read_statuses(self, pad)
+        self.written, self.fields = _HEADER_BYTES, 2  # v and session are with the first key
+        for row in range(self.row_count):
+            _write_field(self, row, pad, pad)
         self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.fields
         return self.written
 
 
-def _sum_covariance(encoder: ContactEncoder, values: memoryview[float], first: int, mount: int) -> None:
+def _is_fresh(encoder: ContactEncoder, pad: int) -> bool:
+    """Return False while samples of a pad are missing."""
+    max_silent_ns = 0 if encoder.synchronous[pad] else _MAX_SILENT_PERIODS * encoder.max_sample_period_ns[pad]
+    return not encoder.silent_ns[pad] > max_silent_ns
+
+
+def _read_statuses(encoder: ContactEncoder, pad: int) -> None:
+    """Set group, statuses and conditions of a contact; in no frame where none is requested."""
+    integers, conditions, values, first = encoder.integers, encoder.conditions, encoder.values, pad * _VALUES
+    in_frames = encoder.palm_requested[pad] or encoder.base_requested[pad]
+    force = encoder.force_status[pad]
+    integers[_POSITION_STATUS], integers[_FORCE_STATUS] = encoder.position_status[pad], force
+    integers[_GROUP] = encoder.group_id[pad] if in_frames else 0
+    integers[_PALM_STATUS] = encoder.palm_status[pad] if in_frames else _NOT_COMPUTED
+    integers[_BASE_STATUS] = encoder.base_status[pad] if in_frames else _NOT_COMPUTED
+    integers[_VECTOR_STATUS] = encoder.vector_status[pad]
+    conditions[_ALWAYS], conditions[_FRAMES] = True, in_frames
+    conditions[_LOCATED] = (
+        _are_finite(values, first + _POSITION, 3)
+        and _are_finite(values, first + _NORMAL, 3)
+        and _are_finite(values, first + _PAD_M, 2)
+    )
+    conditions[_STD] = force in (_FORCE_VALID, _FORCE_UNRELIABLE)
+    conditions[_PALM] = integers[_PALM_STATUS] == _FRAME_VALID
+    conditions[_BASE] = integers[_BASE_STATUS] == _FRAME_VALID
+    conditions[_MODELLED] = encoder.has_sheet_model[pad]
+    conditions[_VECTOR] = encoder.vector_status[pad] != _NOT_COMPUTED
+
+
+def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> None:
+    """Write a field of the layout with its key, unless it is absent; `number` counts its places."""
+    at = row * _ROW_COUNT
+    kind, is_optional = encoder.layout[at], encoder.layout[at + 2]
+    if kind in (_NUMBERS, _SUM):
+        _write_numbers(encoder, row, pad, number)
+    elif kind == _TEXT:
+        _write_pad_text(encoder, pad * encoder.pad_text_count + encoder.layout[at + 5])
+    elif kind == _PARTS:
+        if encoder.parts[_PARTS_COUNT * pad] == encoder.parts[_PARTS_COUNT * pad]:
+            _write_key(encoder, row)
+            _write_parts(encoder, pad)
+    else:
+        value = encoder.integers[encoder.layout[at + 5]]
+        if is_optional and value == encoder.layout[at + 4]:
+            return
+        _write_key(encoder, row)
+        if kind == _INTEGER:
+            _write_integer(encoder, value)
+        elif kind == _SECONDS:
+            _write_double(encoder, value * _SECONDS_PER_NS)
+        elif kind == _NAME:
+            name = encoder.layout[at + 3] + value
+            _write_text(encoder, encoder.text_ends[name], encoder.text_ends[name + 1])
+        else:
+            _write_byte(encoder, 0xC3 if value else 0xC2)
+
+
+def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> None:
+    """Write an array of at most 15 numbers, or one; nil or absent where they are unknown."""
+    at = row * _ROW_COUNT
+    absent, count = encoder.layout[at + 2], encoder.layout[at + 5]
+    first, size = encoder.layout[at + 3] + number * encoder.layout[at + 4], count if count else 1
+    is_met = encoder.conditions[encoder.layout[at + 1]]
+    if not is_met and absent:
+        return
+    is_known = is_met and _are_finite(encoder.state, first, size)
+    is_sum = encoder.layout[at] == _SUM
+    if is_known and is_sum:
+        _sum_covariance(encoder, first, pad * _VALUES + _MOUNT)
+        is_known = _are_finite(encoder.summed, 0, size)
+    if not is_known and absent == 1:
+        return
+    _write_key(encoder, row)
+    if not is_known:
+        _write_byte(encoder, 0xC0)
+        return
+    if count:
+        _write_byte(encoder, 0x90 + count)
+    for i in range(size):
+        _write_double(encoder, encoder.summed[i] if is_sum else encoder.state[first + i])
+
+
+def _sum_covariance(encoder: ContactEncoder, first: int, mount: int) -> None:
     """Set `summed` to a covariance on the pad, plus that of its mount, if the pad's contact has one."""
     known = _are_finite(encoder.values, mount, 9)
     for i in range(9):
-        encoder.summed[i] = values[first + i]
+        encoder.summed[i] = encoder.state[first + i]
         if known:
             encoder.summed[i] += encoder.values[mount + i]
 
 
-def _write_frames(encoder: ContactEncoder, pad: int) -> None:
-    """Write group, palm, base and age of the joints where they are requested and differ from the default."""
-    if not (encoder.palm_requested[pad] or encoder.base_requested[pad]):
-        encoder.field += 10
-        return
-    first = pad * _PALM_VALUES
-    if encoder.group_id[pad] != 0:
-        encoder.fields += 1
-        _write_integer(encoder, encoder.group_id[pad])
-    else:
-        encoder.field += 1
-    _write_frame(encoder, encoder.palm_status[pad], first)
-    _write_frame(encoder, encoder.base_status[pad], first + _BASE)
-    _write_optional_number(encoder, encoder.palm_values[first + _AGE])
-
-
-def _write_frame(encoder: ContactEncoder, status: int, first: int) -> None:
-    """Write status, and if that is valid position, normal and covariance in palm or base."""
-    if status == 0:
-        encoder.field += 4
-        return
-    encoder.fields += 1
-    _write_name(encoder, _FRAME_STATUSES + status)
-    if status != _FRAME_VALID:
-        encoder.field += 3
-        return
-    _write_optional_array(encoder, encoder.palm_values, first, 3)
-    _write_optional_array(encoder, encoder.palm_values, first + 3, 3)
-    _write_optional_array(encoder, encoder.palm_values, first + 6, 9)
-
-
 def _write_parts(encoder: ContactEncoder, pad: int) -> None:
     """Write the two contacts of a pad as maps."""
+    fields = encoder.fields
     in_palm, in_base = encoder.palm_status[pad] == _FRAME_VALID, encoder.base_status[pad] == _FRAME_VALID
-    encoder.field = _KEY_PARTS
-    _write_key(encoder)
     _write_byte(encoder, 0x92)
-    for k in range(2):
-        at = pad * _PARTS_COUNT + k * _PART_COUNT
-        first = pad * _PART_FRAMES + 2 * k * _BASE
-        has_palm = in_palm and _are_finite(encoder.part_frames, first, 1)
-        has_base = in_base and _are_finite(encoder.part_frames, first + _BASE, 1)
-        _write_byte(encoder, 0x85 + (3 if has_palm else 0) + (3 if has_base else 0))
-        encoder.field = _KEY_POSITION
-        _write_array(encoder, encoder.parts, at, 3, True)
-        encoder.field = _KEY_NORMAL
-        _write_array(encoder, encoder.parts, at + 3, 3, True)
-        encoder.field = _KEY_COVARIANCE
-        _sum_covariance(encoder, encoder.parts, at + _PART_COVARIANCE, pad * _VALUES + _MOUNT)
-        _write_array(encoder, encoder.summed, 0, 9, True)
-        encoder.field = _KEY_FORCE
-        _write_number(encoder, encoder.parts[at + _PART_FORCE])
-        encoder.field = _KEY_FORCE_STD
-        _write_number(encoder, encoder.parts[at + _PART_FORCE + 1])
-        if has_palm:
-            encoder.field = _KEY_PALM
-            _write_frame_values(encoder, first)
-        if has_base:
-            encoder.field = _KEY_BASE
-            _write_frame_values(encoder, first + _BASE)
-
-
-def _write_frame_values(encoder: ContactEncoder, at: int) -> None:
-    """Write position, normal and covariance of one of two contacts in palm or base."""
-    _write_array(encoder, encoder.part_frames, at, 3, True)
-    _write_array(encoder, encoder.part_frames, at + 3, 3, True)
-    _write_array(encoder, encoder.part_frames, at + 6, 9, True)
+    for number in range(2 * pad, 2 * pad + 2):
+        first = number * _PART_FRAMES
+        encoder.conditions[_PART_PALM] = in_palm and _are_finite(encoder.part_frames, first, 1)
+        encoder.conditions[_PART_BASE] = in_base and _are_finite(
+            encoder.part_frames, first + _FRAME_VALUES, 1
+        )
+        encoder.fields, header = 0, encoder.written
+        _write_byte(encoder, 0x80)
+        for row in range(encoder.row_count, encoder.row_count + encoder.part_rows):
+            _write_field(encoder, row, pad, number)
+        encoder.message[header] = 0x80 + encoder.fields
+    encoder.fields = fields
 
 
 def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:
@@ -388,18 +331,14 @@ def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:
         encoder.written += 1
 
 
-def _write_key(encoder: ContactEncoder) -> None:
-    _write_text(encoder, encoder.text_ends[encoder.field], encoder.text_ends[encoder.field + 1])
-    encoder.field += 1
+def _write_key(encoder: ContactEncoder, row: int) -> None:
+    encoder.fields += 1
+    _write_text(encoder, encoder.text_ends[row], encoder.text_ends[row + 1])
 
 
-def _write_name(encoder: ContactEncoder, name: int) -> None:
-    _write_key(encoder)
-    _write_text(encoder, encoder.text_ends[name], encoder.text_ends[name + 1])
-
-
-def _write_pad_text(encoder: ContactEncoder, pad: int, number: int) -> None:
-    row = pad * _PAD_TEXTS + number
+def _write_pad_text(encoder: ContactEncoder, row: int) -> None:
+    if encoder.pad_text_ends[row + 1] > encoder.pad_text_ends[row]:
+        encoder.fields += 1
     for i in range(encoder.pad_text_ends[row], encoder.pad_text_ends[row + 1]):
         encoder.message[encoder.written] = encoder.pad_texts[i]
         encoder.written += 1
@@ -410,14 +349,8 @@ def _write_byte(encoder: ContactEncoder, byte: int) -> None:
     encoder.written += 1
 
 
-def _write_truth(encoder: ContactEncoder, truth: bool) -> None:
-    _write_key(encoder)
-    _write_byte(encoder, 0xC3 if truth else 0xC2)
-
-
 def _write_integer(encoder: ContactEncoder, value: int) -> None:
     """Write an integer that isn't negative, as short as it can be."""
-    _write_key(encoder)
     if value < 0x80:
         _write_byte(encoder, value)
         return
@@ -431,46 +364,6 @@ def _write_integer(encoder: ContactEncoder, value: int) -> None:
     _write_byte(encoder, kind)
     for k in range(size):
         _write_byte(encoder, value >> 8 * (size - 1 - k) & 0xFF)
-
-
-def _write_optional_number(encoder: ContactEncoder, value: float) -> None:
-    """Write a number if it is finite."""
-    if -_INFINITY < value < _INFINITY:
-        encoder.fields += 1
-        _write_number(encoder, value)
-    else:
-        encoder.field += 1
-
-
-def _write_number(encoder: ContactEncoder, value: float) -> None:
-    """Write a number, nil if it isn't finite."""
-    _write_key(encoder)
-    if -_INFINITY < value < _INFINITY:
-        _write_double(encoder, value)
-    else:
-        _write_byte(encoder, 0xC0)
-
-
-def _write_optional_array(encoder: ContactEncoder, values: memoryview[float], first: int, count: int) -> None:
-    """Write an array of numbers if they are finite."""
-    if _are_finite(values, first, count):
-        encoder.fields += 1
-        _write_array(encoder, values, first, count, True)
-    else:
-        encoder.field += 1
-
-
-def _write_array(
-    encoder: ContactEncoder, values: memoryview[float], first: int, count: int, valid: bool
-) -> None:
-    """Write an array of at most 15 numbers; nil unless it is valid and finite."""
-    _write_key(encoder)
-    if not valid or not _are_finite(values, first, count):
-        _write_byte(encoder, 0xC0)
-        return
-    _write_byte(encoder, 0x90 + count)
-    for i in range(first, first + count):
-        _write_double(encoder, values[i])
 
 
 def _write_double(encoder: ContactEncoder, value: float) -> None:
