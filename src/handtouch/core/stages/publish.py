@@ -158,16 +158,17 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
 class ContactEncoder:
     """Encoder of contact messages. arrays: flat memory of the arrays of `TickState` by their names.
 
-    Among them are also `state`, the memory of all of them as numbers; position_status, force_status,
-    has_sheet_model: (n,) of the pads; layout: (6 m,) of each field its number in FIELD_KINDS, that in
-    CONDITIONS, and 0 if it is always present, 1 if it is absent where it is unknown, 2 where its condition
-    isn't met; of numbers their first place in the state, the step from one pad to the next, and their count,
-    0 of a single number; of names the first, their default, and their number in INTEGERS. Behind the fields
-    of a contact are those of one of two contacts on a pad, with the step from one to the next; the number of
-    the former is `fields`. texts: packed keys of the fields, then names; text_ends: where each begins, and the
-    last ends. pad_texts: packed fields of the pads, with their keys; empty where one is absent. number: one,
-    of which number_bytes is the memory. message: written. summed (9,), integers and conditions: working
-    memory.
+    Among them are also `state`, the memory of all of them as numbers; position_status, force_status and
+    has_sheet_model, (n,) of the pads; texts, packed keys of the fields, then names, and text_ends, where each
+    begins, and the last ends; pad_texts, packed fields of the pads with keys, empty where they are absent,
+    and pad_text_ends; number, of which number_bytes is the memory; message, which is written; and working
+    memory: summed (9,), integers and conditions.
+
+    layout: (6 m,), of each field its number in FIELD_KINDS; that in CONDITIONS; 0 if it is always present, 1
+    if it is absent where it is unknown, 2 where its condition isn't met; of numbers their first place in the
+    state, the step from one pad to the next, and their count, 0 of a single number; of others the first of
+    their names, their default, and their number in INTEGERS. Behind the `fields` of a contact are those of
+    one of two contacts on a pad, with the step from one to the next.
     """
 
     def __init__(self, fields: int, pad_text_count: int, arrays: Mapping[str, Any]) -> None:

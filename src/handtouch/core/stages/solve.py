@@ -8,49 +8,45 @@ from __future__ import annotations
 
 import math
 
+from handtouch.core.memory import slices_of
 from handtouch.core.stages import force, locate, pairs, tables, tolerances
 from handtouch.field import contact_law
 
-_X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD = 0, 2, 4, 5, 8, 11, 12, 13
-_COVARIANCE, _MOUNT, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _IS_BOUND = 14, 23, 32, 35, 36, 38, 39
-_COUNT = 40
-VALUE_COUNT = _COUNT
-VALUE_SLICES = {
-    "xy": slice(_X, _X + 2),  # on the pad's rectangle
-    "pad_m": slice(_U, _U + 2),
-    "residual": slice(_RESIDUAL, _RESIDUAL + 1),
-    "position_m": slice(_POSITION, _POSITION + 3),
-    "normal": slice(_NORMAL, _NORMAL + 3),
-    "force_n": slice(_FORCE, _FORCE + 1),
-    "force_std_n": slice(_FORCE_STD, _FORCE_STD + 1),
-    "residual_std": slice(_RESIDUAL_STD, _RESIDUAL_STD + 1),  # from channel noise and baseline
-    "covariance_m2": slice(_COVARIANCE, _COVARIANCE + 9),  # without that of the mount
-    "mount_covariance_m2": slice(_MOUNT, _MOUNT + 9),
-    "pad_noise_m2": slice(_PAD_NOISE, _PAD_NOISE + 3),  # of pad_m from channel noise: uu, uv, vv
-    "force_status": slice(_FORCE_STATUS, _FORCE_STATUS + 1),  # of `stages.force`
-    "cells": slice(_CELLS, _CELLS + 2),  # position in the pad's table, where the next tick starts from
-    "squared_misfit": slice(_MISFIT, _MISFIT + 1),  # of a point, see MAX_SQUARED_MISFIT
-    "is_bound": slice(_IS_BOUND, _IS_BOUND + 1),  # 1 where saturated channels leave the position open
-}
-"""Layout of a row of values."""
-_PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD, _PART_COUNT = (
-    0,
-    3,
-    6,
-    15,
-    16,
-    17,
+VALUE_SLICES = slices_of(
+    xy=2,  # on the pad's rectangle
+    pad_m=2,
+    residual=1,
+    position_m=3,
+    normal=3,
+    force_n=1,
+    force_std_n=1,
+    residual_std=1,  # from channel noise and baseline
+    covariance_m2=9,  # without that of the mount
+    mount_covariance_m2=9,
+    pad_noise_m2=3,  # of pad_m from channel noise: uu, uv, vv
+    force_status=1,  # of `stages.force`
+    cells=2,  # position in the pad's table, where the next tick starts from
+    squared_misfit=1,  # of a point, see MAX_SQUARED_MISFIT
+    is_bound=1,  # 1 where saturated channels leave the position open
 )
+"""Layout of a row of values."""
+_X, _U, _RESIDUAL = VALUE_SLICES["xy"].start, VALUE_SLICES["pad_m"].start, VALUE_SLICES["residual"].start
+_POSITION, _NORMAL = VALUE_SLICES["position_m"].start, VALUE_SLICES["normal"].start
+_FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
+_RESIDUAL_STD, _FORCE_STATUS = VALUE_SLICES["residual_std"].start, VALUE_SLICES["force_status"].start
+_COVARIANCE, _MOUNT = VALUE_SLICES["covariance_m2"].start, VALUE_SLICES["mount_covariance_m2"].start
+_PAD_NOISE, _CELLS = VALUE_SLICES["pad_noise_m2"].start, VALUE_SLICES["cells"].start
+_MISFIT, _IS_BOUND = VALUE_SLICES["squared_misfit"].start, VALUE_SLICES["is_bound"].start
+_COUNT = max(at.stop for at in VALUE_SLICES.values())
+VALUE_COUNT = _COUNT
+PART_SLICES = slices_of(position_m=3, normal=3, covariance_m2=9, force_n=1, force_std_n=1)
+"""Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
+_PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
+_PART_COVARIANCE, _PART_FORCE = PART_SLICES["covariance_m2"].start, PART_SLICES["force_n"].start
+_PART_FORCE_STD = PART_SLICES["force_std_n"].start
+_PART_COUNT = max(at.stop for at in PART_SLICES.values())
 _PARTS_COUNT = 2 * _PART_COUNT
 PART_COUNT, PARTS_COUNT = _PART_COUNT, _PARTS_COUNT
-PART_SLICES = {
-    "position_m": slice(_PART_POSITION, _PART_POSITION + 3),
-    "normal": slice(_PART_NORMAL, _PART_NORMAL + 3),
-    "covariance_m2": slice(_PART_COVARIANCE, _PART_COVARIANCE + 9),
-    "force_n": slice(_PART_FORCE, _PART_FORCE + 1),
-    "force_std_n": slice(_PART_FORCE_STD, _PART_FORCE_STD + 1),
-}
-"""Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
 _MOUNT_COUNT = 5
 MOUNT_COUNT = _MOUNT_COUNT
 """Values of a pad's mount."""
