@@ -22,6 +22,8 @@ from handtouch.calibration.calibration import (
 from handtouch.client import request
 from handtouch.config import ConfigError, Deployment, parse
 from handtouch.core.active_calibration import ActiveCalibration
+from handtouch.core.scene import MAX_CLIENTS
+from handtouch.daemon.control import MAX_REPLY_BYTES
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.wire import PadState
@@ -241,6 +243,18 @@ def test_status_lists_computed_outputs_and_their_requesters(served: Bench) -> No
     pads = served.pads(served.ask("scene", links=["plane", "round"]))
     assert pads["round"]["not_computed"]["contact"] == "disabled by me"
     assert pads["resisted"]["not_computed"]["contact"] == "in no scene"
+
+
+def test_no_answer_is_longer_than_stated(served: Bench) -> None:
+    """With as many clients as there may be, as long names and patterns as they may have."""
+    for client in range(MAX_CLIENTS):
+        name = f"{client}".ljust(64, "x")
+        assert served.ask("scene", name=name, links=["*" * 129] * 6, lease_s=3600.0)["ok"]
+    scene, status = served.ask("scene"), served.ask("status")
+    assert len(scene["scenes"]) == 1 + MAX_CLIENTS
+    assert status["scene"]["scenes"]
+    for reply in (scene, status, served.ask("snapshot")):
+        assert len(msgpack.packb(reply)) <= MAX_REPLY_BYTES
 
 
 def test_snapshot_solves_unrequested_outputs_and_leaves_no_trace(served: Bench) -> None:

@@ -21,7 +21,10 @@ from handtouch.wire import PERCEPT_KINDS
 FILE_OWNER, CONTROL_OWNER = "the deployment file", "control"
 MAX_CLIENTS = 32
 MAX_CLIENT_CHARACTERS = 32_768
-"""Length of the patterns of all clients' scenes together, which every answer contains"""
+"""Length of the patterns of all clients' scenes, and of their names once for each pad: answers have them"""
+_TYPICAL_PADS = 15
+_MAX_SUBSCRIPTIONS = 8
+"""Subscriptions that are named for each pad"""
 BoolArray = NDArray[np.bool_]
 _OUTPUTS = ("position", "force", "raw", "palm", "base", *PERCEPT_KINDS)
 
@@ -118,13 +121,15 @@ class ActiveScenes:
             self._merge()
 
     def check_size(self, client: str, links: Sequence[str]) -> None:
-        """Raise ValueError if a client's patterns make those of all clients longer than an answer may be."""
-        others = [held.scene.links for name, (held, _) in self._clients.items() if name != client]
-        size = sum(len(pattern) for patterns in (links, *others) for pattern in patterns)
-        if size > MAX_CLIENT_CHARACTERS:
+        """Raise ValueError if a client's scene would make an answer longer than it may be."""
+        patterns = {name: held.scene.links for name, (held, _) in self._clients.items()} | {client: links}
+        pads = len(self.names)
+        size = sum(len("".join(links)) + pads * len(name) for name, links in patterns.items())
+        limit = MAX_CLIENT_CHARACTERS * max(pads, _TYPICAL_PADS) // _TYPICAL_PADS
+        if size > limit:
             raise ValueError(
-                f"the patterns of all clients' scenes have {size} characters, and may have "
-                f"{MAX_CLIENT_CHARACTERS}; use wildcards, or wait until a lease ends"
+                f"the patterns of all clients' scenes, and their names for each pad, have {size} characters, "
+                f"and may have {limit}; use wildcards and shorter names, or wait until a lease ends"
             )
 
     def client_scene(self, client: str) -> SceneRequest | None:
@@ -258,6 +263,9 @@ class Demand:
         for pad, (hand, link) in enumerate(self.scenes.names):
             topics = (f"contact/{hand}/{link}".encode(), f"hand/{hand}".encode())
             subscribed = [text for prefix, text in subscriptions if any(t.startswith(prefix) for t in topics)]
+            if len(subscribed) > _MAX_SUBSCRIPTIONS:
+                further = len(subscribed) - _MAX_SUBSCRIPTIONS + 1
+                subscribed[_MAX_SUBSCRIPTIONS - 1 :] = [f"{further} more"]
             computed, skipped = self._computed_and_skipped(pad, bool(subscribed))
             described.append(
                 {

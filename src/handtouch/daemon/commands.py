@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import msgpack
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -27,6 +28,8 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import Demand
 from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
+    MAX_REPLY_BYTES,
+    MAX_REPLY_PADS,
     Command,
     Job,
     JobCommand,
@@ -42,6 +45,7 @@ from handtouch.host.logs import set_level
 
 STATUS_AGE_NS = 100_000_000
 """Age up to which a status is returned again, as making it takes milliseconds"""
+_ENVELOPE_BYTES = 100  # v, ok, now_ns
 _log = logging.getLogger("handtouch.control")
 
 PadPattern = Annotated[str, Field(max_length=129)]
@@ -147,6 +151,9 @@ class ControlCommands:
         if self._status_ns is None or now_ns - self._status_ns >= STATUS_AGE_NS:
             self._status_ns = now_ns
             self._status_reply = {**self._reporter.status(now_ns), "scene": self._scene_reply(now_ns)}
+            limit = MAX_REPLY_BYTES * max(len(self._pad_names), MAX_REPLY_PADS) // MAX_REPLY_PADS
+            if len(msgpack.packb(self._status_reply)) > limit - _ENVELOPE_BYTES:
+                self._status_reply["scene"] = {"scenes": [], "pads": []}
         return {**self._status_reply, "now_ns": time.monotonic_ns()}
 
     def _snapshot(self, arguments: dict[str, Any], now_ns: int) -> Reply:

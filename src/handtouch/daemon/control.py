@@ -26,6 +26,9 @@ MAX_JOBS = 8
 """Jobs in progress at a time"""
 MAX_JOBS_PER_CLIENT = 2
 """Jobs of one connection in progress at a time"""
+MAX_REPLY_BYTES = 65_536
+"""Longest reply for a hand of MAX_REPLY_PADS; for more pads longer in proportion"""
+MAX_REPLY_PADS = 15
 LOOP_FRACTION = 0.05
 """Largest fraction of time for answering requests, on average"""
 _MAX_SAVED_NS = 500_000

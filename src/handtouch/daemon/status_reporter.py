@@ -36,6 +36,7 @@ from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.wire import AdaptationStatusName, NodeStateName, PadState, ShearStatusName
 
 _SECOND_NS = 1_000_000_000
+_MAX_SUBSCRIPTIONS = 100  # in `service`
 _HEALTH_PERIOD_NS = round(wire.HEALTH.period_s * _SECOND_NS)
 _SERVICE_PERIOD_NS = round(wire.SERVICE.period_s * _SECOND_NS)
 _log = logging.getLogger("handtouch.health")
@@ -413,7 +414,7 @@ class StatusReporter:
             congestion_episodes=dict(self._publisher.congestion_episodes),
             subscriptions=tuple(
                 sorted(prefix.decode("utf-8", "replace") for prefix in self._publisher.subscriptions)
-            ),
+            )[:_MAX_SUBSCRIPTIONS],
             retained=False,
             supervisor=self.supervisor.statistics() if self.supervisor is not None else None,
             percepts=self.percepts.statistics() if self.percepts is not None else None,

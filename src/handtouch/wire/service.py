@@ -222,7 +222,7 @@ class Service:
     """stream (`live`, `complete`) -> times that a message found the queue of a subscriber full; each may cost
     that subscriber many messages"""
     subscriptions: tuple[str, ...]
-    """subscribed prefixes"""
+    """subscribed prefixes, 100 of them at most"""
     retained: bool
     supervisor: Annotated[dict[str, Any], SupervisorStatistics] | None = None
     """the supervisor process; absent without supervision"""
