@@ -37,7 +37,7 @@ from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 _SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 """Interfaces on which sent frames are received, and counted, again."""
-CABLELESS_INTERFACES = frozenset({"udp_multicast", "virtual"})
+_CABLELESS_INTERFACES = frozenset({"udp_multicast", "virtual"})
 """python-can's interfaces between programs"""
 _INTERFACES_WITHOUT_BITRATE = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces whose bit rate python-can can't set."""
@@ -103,6 +103,11 @@ class Port:
     def bus_state(self) -> BusState:
         """State of the bus as of the last `update_state`."""
         return self.router.bus_state
+
+    @property
+    def is_cableless(self) -> bool:
+        """True if the bus is between programs, without a cable that may be at fault."""
+        return self.bus.interface in _CABLELESS_INTERFACES
 
     @property
     def problem(self) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.canbus.bus.port import CABLELESS_INTERFACES, Port
+from handtouch.canbus.bus.port import Port
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.managed_node import ManagedNode
 
@@ -79,7 +79,7 @@ class BusCauses:
         if not self._sync_period_ns or silent_ns <= _MISSED_SYNC_PERIODS * self._sync_period_ns:
             return ""
         since = f" for {silent_ns / 1e6:.0f} ms" if port.last_sync_ns else " yet"
-        cable = "" if _is_simulated(port) else " and cable"
+        cable = "" if port.is_cableless else " and cable"
         return f"no SYNC on bus {port.name}{since}; check its SYNC producer{cable}"
 
     def _describe_pause(self, silent_ns: int, now_ns: int) -> str:
@@ -91,8 +91,4 @@ class BusCauses:
 
 
 def _remedy(port: Port) -> str:
-    return _SIMULATED_REMEDY if _is_simulated(port) else _BUS_REMEDY
-
-
-def _is_simulated(port: Port) -> bool:
-    return port.bus.interface in CABLELESS_INTERFACES
+    return _SIMULATED_REMEDY if port.is_cableless else _BUS_REMEDY

@@ -11,7 +11,6 @@ from typing import assert_never
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes import instability, silence
 from handtouch.canbus.nodes.lifecycle_types import (
-    CONNECTION_REMEDY,
     BootUpReceived,
     BusRecovered,
     BusRole,
@@ -309,7 +308,7 @@ def _on_step_failed(life: Lifecycle, event: StepFailed, now_ns: int, timing: Nod
     )
     present = event.answered or life.state in (NodeState.IDENTIFIED, NodeState.CONFIGURING)
     if event.timed_out and not present and quiet_ns > timing.heartbeat_timeout_ns:
-        reason = f"lost: no message for {quiet_ns / 1e6:.0f} ms; {CONNECTION_REMEDY}"
+        reason = f"lost: no message for {quiet_ns / 1e6:.0f} ms; {timing.connection_remedy}"
         return enter(life, NodeState.ABSENT, now_ns, reason)._replace(last_heartbeat_ns=None), ()
     return enter(life, NodeState.FAULTED, now_ns, event.reason), ()
 
@@ -423,10 +422,10 @@ def _on_timer_expired(life: Lifecycle, event: TimerExpired, now_ns: int, timing:
     if now_ns < life.due_ns:
         return life, ()
     if life.state is NodeState.ABSENT and timing.role is BusRole.LISTENER:
-        life = silence.review_loss(life, event.bus_cause, now_ns)
+        life = silence.review_loss(life, event.bus_cause, now_ns, timing)
         return life._replace(due_ns=now_ns + silence.BUS_CAUSE_DELAY_NS if life.bus_cause else NEVER_NS), ()
     if life.state is NodeState.ABSENT:
-        life = silence.review_loss(life, event.bus_cause, now_ns)
+        life = silence.review_loss(life, event.bus_cause, now_ns, timing)
         probes = life.unanswered_probes + 1
         return life._replace(unanswered_probes=probes, due_ns=now_ns + timing.retry_delay_ns(probes)), (
             NodeAction.PROBE,

@@ -57,9 +57,13 @@ class BusRole(Enum):
     LISTENER = "listener"  # sends nothing
 
 
+CONNECTION_REMEDY = "check its power, cable, node id and the bit rate and termination of the bus"
+CABLELESS_REMEDY = "check that its program runs, its node id, and the host's load"
+
+
 @dataclass(frozen=True, slots=True)
 class NodeTiming:
-    """Times of one node [ns], and handtouch's role on its bus."""
+    """Times of one node [ns], handtouch's role on its bus, and what to check when nothing is heard of it."""
 
     heartbeat_period_ns: int
     heartbeat_timeout_ns: int
@@ -70,13 +74,11 @@ class NodeTiming:
     max_retry_ns: int = 5_000_000_000
     """also: a node that has operated for so long is stable, and its next restart is the first again"""
     allow_nmt_reset: bool = True
+    connection_remedy: str = CONNECTION_REMEDY
 
     def retry_delay_ns(self, failures: int) -> int:
         """Return the delay after that many consecutive failures: doubled with each, up to `max_retry_ns`."""
         return min(self.min_retry_ns << min(max(failures - 1, 0), 16), self.max_retry_ns)
-
-
-CONNECTION_REMEDY = "check its power, cable, node id and the bit rate and termination of the bus"
 
 
 class Lifecycle(NamedTuple):

@@ -13,6 +13,8 @@ from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import Port
 from handtouch.canbus.nodes import boot
 from handtouch.canbus.nodes.lifecycle_types import (
+    CABLELESS_REMEDY,
+    CONNECTION_REMEDY,
     BusRole,
     Lifecycle,
     NodeAction,
@@ -112,9 +114,11 @@ def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns:
         settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
         role=BusRole(port.bus.role),
         allow_nmt_reset=spec.allow_nmt_reset,
+        connection_remedy=CABLELESS_REMEDY if port.is_cableless else CONNECTION_REMEDY,
     )
     sdo = SdoTransport(spec.node_id, port.send, received_until_ns=lambda: port.received_until_ns)
     node = ManagedNode(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), sdo)
+    node.lifecycle = Lifecycle(reason=f"no message received yet; {timing.connection_remedy}")
     if timing.role is BusRole.LISTENER:  # it can't be read from the node
         node.mapping = mapping_from_eds(spec.eds, spec.node_id, spec.channels, spec.channel_states)
     return node

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.lifecycle_types import (
-    CONNECTION_REMEDY,
     BusRole,
     Lifecycle,
     NodeAction,
@@ -101,7 +100,7 @@ def on_heartbeat_timeout(
             last_heartbeat_ns=None, failures=failures, due_ns=now_ns + timing.retry_delay_ns(failures)
         )
     silence = f"lost: no heartbeat for {quiet_ns / 1e6:.0f} ms"
-    cause = f", {bus_cause}" if bus_cause else f"; {CONNECTION_REMEDY}"
+    cause = f", {bus_cause}" if bus_cause else f"; {timing.connection_remedy}"
     life = enter(life, NodeState.ABSENT, now_ns, silence + cause)
     return life._replace(
         silence=silence,
@@ -176,7 +175,7 @@ def _with_heartbeat_reason(life: Lifecycle, timing: NodeTiming) -> Lifecycle:
     return life._replace(reason=f"{_SLOW_HEARTBEAT}: {text}, while its samples arrive; {remedy}")
 
 
-def review_loss(life: Lifecycle, bus_cause: str, now_ns: int) -> Lifecycle:
+def review_loss(life: Lifecycle, bus_cause: str, now_ns: int, timing: NodeTiming) -> Lifecycle:
     """Name the node's own connection as the cause when the others of its bus have been back for a while."""
     if bus_cause or not life.bus_cause:
         return life._replace(alone_ns=None)
@@ -184,5 +183,5 @@ def review_loss(life: Lifecycle, bus_cause: str, now_ns: int) -> Lifecycle:
         return life._replace(alone_ns=now_ns)
     if now_ns - life.alone_ns < BUS_CAUSE_DELAY_NS:
         return life
-    life = enter(life, NodeState.ABSENT, now_ns, f"{life.silence}; {CONNECTION_REMEDY}")
+    life = enter(life, NodeState.ABSENT, now_ns, f"{life.silence}; {timing.connection_remedy}")
     return life._replace(bus_cause="")
