@@ -105,6 +105,20 @@ def test_time_out_in_the_boot_names_its_object_where_the_node_answers_others(
     assert all(f"0x{where[0]:04X}:{where[1]:02X}" in reason for reason in reasons)
 
 
+def test_a_serial_number_that_is_not_answered_is_no_other_node(make_rig: Make) -> None:
+    """It is asked again, and the reason names the object: the node or its bus may be busy."""
+    rig = make_rig(1, serial=101)
+    rig.node(1).sdo.fail[0x1018, 4] = None
+    rig.plug_all()
+    rig.start()
+    reasons = {event.reason for event in rig.run(4000) if event.new_state is FAULTED}
+    assert reasons
+    assert all("0x1018:04" in reason and "mismatch" not in reason for reason in reasons)
+    del rig.node(1).sdo.fail[0x1018, 4]
+    rig.run(6000)
+    assert rig.state(1) is OPERATIONAL
+
+
 def test_slow_heartbeat_is_measured_and_its_remedy_named(make_rig: Make) -> None:
     rig = make_rig(1)
     rig.boot()

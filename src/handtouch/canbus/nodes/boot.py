@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.spec import Identity, IdleSettings, NodeSpec
@@ -55,9 +55,17 @@ def read_identity(sdo: NodeSdoClient) -> Identity:
     return Identity(sdo.read(cia301.IDENTITY, 1, first), *optional)
 
 
-def identify_node(sdo: NodeSdoClient) -> Identification:
-    """Read 0x1018, and the errors that the node reports."""
-    return Identification(read_identity(sdo), read_errors(sdo))
+def identify_node(sdo: NodeSdoClient, expected: NodeSpec) -> Identification:
+    """Read 0x1018, and the errors that the node reports.
+
+    Raises BootStepError where the node doesn't answer what tells whether it is the expected one: it may be
+    busy, or frames may be lost.
+    """
+    identity = read_identity(sdo)
+    for sub, (key, name) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
+        if getattr(identity, key) is None and getattr(expected, key) is not None:
+            identity = replace(identity, **{key: sdo.read_or_none(cia301.IDENTITY, sub, name)})
+    return Identification(identity, read_errors(sdo))
 
 
 def check_identity(identity: Identity, expected: NodeSpec) -> None:
@@ -66,7 +74,7 @@ def check_identity(identity: Identity, expected: NodeSpec) -> None:
     for sub, (key, name) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
         actual, configured = getattr(identity, key), getattr(expected, key)
         if configured is not None and actual != configured and not (owner and key == "serial"):
-            refused = f"none, as 0x1018:{sub:02} is refused by the node or unanswered"
+            refused = f"none, as 0x1018:{sub:02} is refused by the node"
             value = refused if actual is None else f"{actual} (0x{actual:X})"
             raise BootStepError(
                 f"identity mismatch: {name} is {value}, configured is {configured} (0x{configured:X}); "

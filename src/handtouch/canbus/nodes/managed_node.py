@@ -157,7 +157,7 @@ def run_step(
 def _perform_step(node: ManagedNode, sdo: NodeSdoClient, step: NodeAction, idle: bool) -> StepResult | None:
     spec = node.spec
     if step is NodeAction.IDENTIFY:
-        return boot.identify_node(sdo)
+        return boot.identify_node(sdo, spec)
     if step is NodeAction.READ_ERRORS:
         return boot.read_errors(sdo, with_behaviour=True)
 
