@@ -6,9 +6,14 @@ Ticks only collect samples (`stages.detect`, the `block_...` arrays of the state
 is then processed at once (`update_baseline`), with its duration, so that tick rate and missing samples make
 no difference. Rules:
 * An untouched pad's baseline is tracked with a time constant, up to a maximum rate: a slower rise is drift.
+* No contact lowers a channel. Where one falls slowly, the whole reading is drift and is tracked at any rate;
+  a step is a fault, not drift.
+* A quiet pad whose baseline was never known has the zeros that it reads, if no contact could cause them.
+* Hum and noise move channels below the baseline as often as above it. Their amplitude raises thresholds.
 * A touched pad's baseline is held, after release too, until the pad reads nearly its baseline again: leakage
   or creep neither triggers another contact nor becomes the baseline.
-* The common drift of a hand's untouched pads (temperature, supply) is applied to touched ones too.
+* The common drift of a hand's untouched pads (temperature, supply), a median without pads that a light
+  contact may load, is applied to touched ones too.
 * The initial baseline and its standard deviation decide whether a first reading is a contact.
 * A sheet only sinks current. A reading below the baseline means that the pad was touched when that was
   learned, too lightly to be distinguished from an offset: the baseline is learned again.
@@ -40,6 +45,14 @@ _INITIAL_DRIFT_SIGMA_PER_S = 0.02  # initial drift over the noise
 _MAX_RETURN_FRACTION = 0.5  # distance of a released pad from its baseline over the end threshold
 _CONFIDENCE_SIGMA = 3.0  # deviations of an untouched pad up to a threshold
 _MIN_COMMON_DRIFT_PADS = 3  # untouched pads of a hand
+_FALLING_TIME_S = 2.0  # time constant of readings that no contact causes
+_MAX_FALL_SIGMA = 10.0  # more is a step: such samples are implausible, see `stages.detect`
+_MIN_FALL_FRACTION = 0.02  # of all channels: as much may be a wrong gain
+_MIN_CONTACT_SPREAD = 0.3  # of the mean of a pad's channels; drift of temperature or supply moves them alike
+_QUIET_SIGMA = 3.0  # of a channel's noise in a block: not held by a hand
+_MIN_CROSSINGS = 6.0  # of the mean in a block: 31 Hz, a hand touches and trembles more slowly
+_DISTURBANCE_TIME_S = 60.0  # time in which a disturbance that has gone is forgotten
+_DISTURBANCE_MARGIN = 1.5  # of thresholds over the sum of the amplitudes
 _GRAVITY_GAIN, _MIN_TURN_SQUARED = 0.02, 0.05  # fraction of an innovation; squared change of unit gravity
 
 
@@ -54,7 +67,8 @@ class Baseline:
     untouched samples; `held` (n,): touched, or released and not back yet; `unverified` (n,): no reading has
     agreed with the baseline yet; `known` (n,): set, or measured untouched; `drift_speed` (n,): recent drift
     of the sum, without the common one [counts/s]; `gravity_slope` (n, c, 3): change of a channel per unit of
-    gravity.
+    gravity; `disturbance` (n, c): amplitude of hum and noise [counts], by which `threshold_factor` (n,)
+    raises the thresholds of contacts.
     """
 
     def __init__(
@@ -68,6 +82,7 @@ class Baseline:
         electrode_counts: IntArray | None = None,
     ) -> None:
         n, hands = len(noise_counts), list(hands)
+        self._hands = hands
         held = TickState.empty(n, len(hands)) if state is None else state
         self._channels = np.full(n, held.channels) if electrode_counts is None else electrode_counts
         self._used = (np.arange(held.channels) < self._channels[:, None]).astype(np.float64)
@@ -83,6 +98,7 @@ class Baseline:
         """drift per channel common to each hand's pads"""
         self.std[:] = begin_counts / _CONFIDENCE_SIGMA
         self.noise_squared[:] = np.square(noise_counts)[:, None] * self._used
+        self._update_channel_noise()
         self.drift_speed[:] = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
         self.expected_counts = np.zeros((n, held.channels))
         """(n, c) counts to subtract from a reading"""
@@ -91,6 +107,11 @@ class Baseline:
             self._hand_membership[row, pads] = 1.0
         self._sum, self._squares, self._count = held.block_sum, held.block_squares, held.block_count
         self._blocks, self._block_begin_ns = held.blocks, held.block_begin_ns
+        self._span_sum, self._span_squares = held.span_sum, held.span_squares
+        self._span_low, self._span_count = held.span_low, held.span_count
+        self._span_crossings, self._span_level = held.span_crossings, held.span_level
+        self._earlier, self.disturbance = held.earlier_disturbance, held.disturbance
+        self.threshold_factor = held.threshold_factor
         self._drift_until_ns = held.drift_until_ns  # time of each pad's last offset update
         self._anchor, self._anchored_s = held.drift_anchor, held.drift_anchored_s
 
@@ -103,6 +124,7 @@ class Baseline:
     ) -> None:
         """Change the settings of all pads. Call it also after the state was loaded."""
         self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+        self._update_channel_noise()
         self._update_expected()
 
     def set_offset(self, pad: int, offset: npt.ArrayLike, std: npt.ArrayLike = 0.0) -> None:
@@ -122,6 +144,8 @@ class Baseline:
         """Forget what was learned of a pad, because its node was replaced."""
         self.gravity_slope[pad] = 0.0
         self.noise_squared[pad] = self._noise[pad] ** 2 * self._used[pad]
+        self.disturbance[pad] = self._earlier[pad] = 0.0
+        self._update_channel_noise()
         self.drift_speed[pad] = _INITIAL_DRIFT_SIGMA_PER_S * self._noise[pad]
         std = self._begin_threshold[pad] / (self._root_channels[pad] * _CONFIDENCE_SIGMA)
         self.set_offset(pad, np.zeros(self._channels[pad]), std)
@@ -156,12 +180,19 @@ class Baseline:
         sampled = self._count > 0
         mean = self._sum / np.maximum(self._count, 1.0)[:, None]
         total = mean @ self._ones
-        self._release_returned(sampled & ~touching, total)
+        self._update_disturbance(elapsed_ns * 1e-9)
+        mean_std = self._channel_noise / np.sqrt(np.maximum(self._count, 1.0))[:, None]
+        whole = self._count >= self._span_count  # no sample is left out that may have been above a threshold
+        falls = whole & self._falls(mean, mean_std)
+        if np.count_nonzero(unknown := falls & sampled & ~touching & ~self.known):
+            self._learn_zeros(unknown, mean, mean_std)
+            sampled &= ~unknown
+        self._release_returned(sampled & whole & ~touching, total)
         free = sampled & ~self.held
         dt_s = np.asarray((sync_ns - self._drift_until_ns) * 1e-9, np.float64)
         np.copyto(self._drift_until_ns, sync_ns, where=free | self.held)
-        moved = self._track_offsets(mean, free, dt_s)
-        self._update_drift(moved @ self._ones, free, elapsed_ns * 1e-9, dt_s)
+        moved = self._track_offsets(mean, falls, free, dt_s)
+        self._update_drift(moved, free & ~self._may_be_contact(mean, mean_std), free, elapsed_ns * 1e-9, dt_s)
         self._blocks[0] += 1
         if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
             self._update_noise(mean, free)
@@ -171,9 +202,56 @@ class Baseline:
         self._sum[:] = 0.0
         self._squares[:] = 0.0
         self._count[:] = 0.0
+        self._span_level[:] = (self._span_sum @ self._ones) / np.maximum(self._span_count, 1.0)
+        self._span_sum[:] = self._span_squares[:] = 0.0
+        self._span_count[:] = self._span_crossings[:] = 0.0
         return True
 
     # Details: parts of `update_baseline` --------------------------------------------------------------------
+
+    def _update_disturbance(self, elapsed_s: float) -> None:
+        """Measure how far hum and noise move each channel, at the least in the last three blocks: faster than
+        a hand touches, and down to where no contact is."""
+        count = np.maximum(self._span_count, 1.0)[:, None]
+        variance = np.maximum(self._span_squares / count - np.square(self._span_sum / count), 0.0)
+        known = self._span_count >= _MIN_VARIANCE_SAMPLES
+        moves = self._span_crossings >= np.minimum(_MIN_CROSSINGS, self._span_count - 2)
+        moves &= self._span_low < self._end_threshold * self.threshold_factor
+        now = np.sqrt(2 * variance * moves[:, None])
+        lasting = np.minimum(now, self._earlier.min(axis=1))
+        kept = np.where(self.touching, 1.0, np.exp(-elapsed_s / _DISTURBANCE_TIME_S))[:, None]
+        level = np.maximum(lasting, self.disturbance * kept)
+        np.copyto(self.disturbance, level, where=known[:, None])
+        self._earlier[known, 0] = self._earlier[known, 1]
+        self._earlier[known, 1] = now[known]
+        raised = _DISTURBANCE_MARGIN * (self.disturbance @ self._ones) / self._begin_threshold
+        np.maximum(raised, 1.0, out=self.threshold_factor)
+
+    def _falls(self, mean: FloatArray, mean_std: FloatArray) -> BoolArray:
+        """Return the pads (n,) with a channel so much below the baseline that no contact explains it."""
+        least = _MIN_FALL_FRACTION * (np.abs(mean) @ self._ones)[:, None] + _CONFIDENCE_SIGMA * mean_std
+        return np.asarray((mean < -least).any(axis=1))
+
+    def _learn_zeros(self, unknown: BoolArray, mean: FloatArray, mean_std: FloatArray) -> None:
+        """Take the readings of quiet pads, which no contact causes, as their unknown baselines."""
+        spare = np.maximum(self._count - 1, 1.0)[:, None]
+        variance = (self._squares - self._sum * mean) / spare
+        quiet = (variance <= np.square(_QUIET_SIGMA * self._channel_noise)).all(axis=1)
+        learned = unknown & quiet & (self._count >= _MIN_VARIANCE_SAMPLES)
+        self.offset += mean * learned[:, None]
+        self.std[learned] = np.sqrt(np.square(mean_std[learned] * self._used[learned]).sum(axis=1))
+        self.unverified[learned], self.known[learned] = False, True
+        self.held[learned] = False
+
+    def _may_be_contact(self, mean: FloatArray, mean_std: FloatArray) -> BoolArray:
+        """Return the pads (n,) that a contact below the threshold may load: no channel has fallen, and they
+        rise by different amounts."""
+        used = self._used > 0
+        low = np.where(used, mean, np.inf).min(axis=1)
+        high = np.where(used, mean, -np.inf).max(axis=1)
+        noise = _CONFIDENCE_SIGMA * mean_std.max(axis=1)
+        average = (mean @ self._ones) / self._channels
+        return np.asarray((low > -noise) & (high - low > 2 * noise + _MIN_CONTACT_SPREAD * average))
 
     def _release_returned(self, sampled: BoolArray, total: FloatArray) -> None:
         """End the hold of pads that read nearly their baseline again."""
@@ -206,29 +284,35 @@ class Baseline:
             self.unverified[first], self.known[first] = False, True
         self.held &= ~back
 
-    def _track_offsets(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> FloatArray:
-        """Move offsets towards the readings: do/dt = excess / time constant, up to the maximum rate. Return
-        the change (n, c). Exact for a constant reading, whatever the intervals."""
+    def _track_offsets(
+        self, mean: FloatArray, falls: BoolArray, free: BoolArray, dt_s: FloatArray
+    ) -> FloatArray:
+        """Move offsets towards the readings: do/dt = excess / time constant, up to the maximum rate unless
+        they fall. Return the change (n, c). Exact for a constant reading, whatever the intervals."""
         excess = np.abs(mean) @ self._ones
         linear = self._max_rate * _TRACKING_TIME_S
         bound_s = np.maximum(excess - linear, 0.0) / self._max_rate
         remaining = np.minimum(excess, linear) * np.exp(np.minimum(bound_s - dt_s, 0.0) / _TRACKING_TIME_S)
         remaining = np.maximum(remaining, excess - self._max_rate * dt_s)
         fraction = (1 - remaining / np.maximum(excess, 1e-12)) * free
+        if np.count_nonzero(falling := falls & free):
+            falling &= (mean > -_MAX_FALL_SIGMA * self._noise[:, None]).all(axis=1)
+            fraction[falling] = -np.expm1(-dt_s[falling] / _FALLING_TIME_S)
         moved = mean * fraction[:, None]
         self.offset += moved
         return np.asarray(moved)
 
-    def _update_drift(self, moved: FloatArray, free: BoolArray, elapsed_s: float, dt_s: FloatArray) -> None:
-        """Apply the untouched pads' common drift to held ones, and propagate the standard deviations."""
-        pads = self._hand_membership @ free
-        shift = np.where(
-            pads >= _MIN_COMMON_DRIFT_PADS,
-            self._hand_membership
-            @ (moved * free)
-            / np.maximum(self._hand_membership @ (self._channels * free), 1.0),
-            0.0,
-        )
+    def _update_drift(
+        self, moved: FloatArray, unloaded: BoolArray, free: BoolArray, elapsed_s: float, dt_s: FloatArray
+    ) -> None:
+        """Apply the drift common to the unloaded pads of a hand to held ones, and propagate the standard
+        deviations."""
+        shift = np.zeros(len(self._hands))
+        per_channel = (moved @ self._ones) / self._channels
+        for row, pads in enumerate(self._hands):
+            counted = np.sort(per_channel[pads][unloaded[pads]])
+            if len(counted) >= _MIN_COMMON_DRIFT_PADS:  # its median
+                shift[row] = 0.5 * (counted[len(counted) // 2] + counted[(len(counted) - 1) // 2])
         self.common_drift += shift
         kept = shift @ self._hand_membership * self.held
         self.offset += kept[:, None] * self._used
@@ -251,6 +335,12 @@ class Baseline:
         variance = (self._squares - self._sum * mean) / spare
         part = -np.expm1(-_NOISE_PERIOD_BLOCKS * BLOCK_DURATION_NS * 1e-9 / _NOISE_TIME_S) * enough
         self.noise_squared += (variance - self.noise_squared) * part[:, None]
+        self._update_channel_noise()
+
+    def _update_channel_noise(self) -> None:
+        stated = np.square(self._noise)[:, None]
+        self._channel_noise = np.sqrt(np.maximum(self.noise_squared, stated))
+        """(n, c) the larger of the stated and the measured standard deviation"""
 
     def _update_gravity_slope(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:
         """Update gravity slopes from the unexplained rest of offsets and the change of gravity (normalised

@@ -142,6 +142,25 @@ class TickState:
     block_count: Annotated[FloatArray, Stored("<f8", _PADS)]
     block_begin_ns: Annotated[IntArray, Stored("<i8", 1, fill=-_MAX_PAUSE_NS)]
     blocks: Annotated[IntArray, Stored("<i8", 1)]
+    span_sum: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
+    """of all samples since the last block, touched or not, of channels within their ranges, so that what
+    moves an untouched pad beyond a threshold is measured, too"""
+    span_squares: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
+    span_count: Annotated[FloatArray, Stored("<f8", _PADS)]
+    span_low: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """least sum of the channels among these samples [counts]"""
+    span_crossings: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """changes of the sum from above to below `span_level`, or back"""
+    span_level: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """mean sum of the samples of the block before [counts]"""
+    span_above: Annotated[BoolArray, Stored("?", _PADS)]
+    """the last of these sums was above `span_level`"""
+    earlier_disturbance: Annotated[FloatArray, Stored("<f8", _PADS, 2, _CHANNELS)]
+    """of the two blocks before"""
+    disturbance: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
+    """amplitude of hum and noise [counts]"""
+    threshold_factor: Annotated[FloatArray, Stored("<f8", _PADS, fill=1)]
+    """by which hum and noise raise the thresholds of contacts"""
 
     # compensation of sheet behaviour, see `SheetForceCompensation`
     compensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]

@@ -27,6 +27,7 @@ from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.stages.shear import SHEAR_CHANNELS
+from handtouch.daemon.noise_report import NoiseReport
 from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.percept_client import PerceptClient
 from handtouch.daemon.publisher import Publisher
@@ -122,6 +123,7 @@ class StatusReporter:
         self._rates_hz: dict[str, float] = {}
         self._rejected_adaptation = np.zeros(n, dtype=np.bool_)
         self._shear_channels = ShearChannels()
+        self._noise = NoiseReport(len(self._pads))
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
         self._logged_problems = dict.fromkeys(ports, "")  # last problem of each bus, without digits
@@ -313,6 +315,8 @@ class StatusReporter:
             rate_hz=self._sample_rate_hz.tolist(),
             modelled=tick.sheet_force.modelled.tolist(),
             railed=pipeline.slab.saturated(tick.channel_counts),
+            zeros_known=tick.state.known.tolist(),
+            noisy=self._noise.find(tick),
         )
 
     def _make_health(self, pad: int, columns: _PadColumns, now_ns: int) -> wire.Health:
@@ -320,6 +324,10 @@ class StatusReporter:
         status = self._master.node_status(pad)
         sample_ns, state = columns.sample_ns[pad], PadState(columns.state[pad])
         counts = self._pipeline.tick.counts[pad]
+        assessment = self.supervisor.health_fields(pad) if self.supervisor is not None else {}
+        noise = self._noise.update(self._pipeline.tick, pad, settings.node, now_ns, noisy=columns.noisy[pad])
+        if noise is not None:
+            assessment["diagnoses"] = (*assessment.get("diagnoses", ()), noise.to_map())
         return wire.Health(
             v=wire.SCHEMA_VERSION,
             session=self._publisher.session,
@@ -341,6 +349,7 @@ class StatusReporter:
                 settings.electrode_names,
                 counts,
                 columns.railed[pad, : len(counts)],
+                zeros_known=columns.zeros_known[pad],
             ),
             serial=status.serial,
             rate_hz=columns.rate_hz[pad] if state <= PadState.TOUCHED else 0.0,
@@ -355,7 +364,7 @@ class StatusReporter:
             error_history=status.error_history,
             adaptation_status=self._adaptation_status(pad) if columns.modelled[pad] else "",
             shear_status=self._shear_status(pad, touched=state == PadState.TOUCHED),
-            **(self.supervisor.health_fields(pad) if self.supervisor is not None else {}),
+            **assessment,
         )
 
     def _adaptation_status(self, pad: int) -> AdaptationStatusName:
@@ -454,6 +463,8 @@ class _PadColumns(NamedTuple):
     rate_hz: list[float]
     modelled: list[bool]
     railed: NDArray[np.bool_]
+    zeros_known: list[bool]
+    noisy: list[bool]
 
 
 class _RateWindow:

@@ -24,6 +24,8 @@ from handtouch.host.units import GRAM_FORCE_N
 MAX_USUAL_LOAD = 0.7  # share of the bit rate that leaves reserve for retransmissions
 MAX_USUAL_ASPECT = 3.0  # beyond it errors along the short side grow (docs/theory.md)
 MAX_USUAL_THRESHOLD_N = 1.0
+MAINS_HZ = (50, 60)
+MAX_TOUCH_HZ = 30.0  # faster motion of an untouched pad is hum, see `core.baseline`
 """Largest usual threshold: fingers grasp with a few newtons; the shipped hands have 0.06 N"""
 MIN_USUAL_SHEET_OHM = 20.0
 """Least usual resistance of a sheet: leads of 1 ohm are 5 % of it; the paper's sheets have 2.4 and 15 kohm"""
@@ -91,6 +93,7 @@ def find_warnings(deployment: config.Deployment) -> Iterator[str]:
                 f"[node.{name}]: full_scale_counts = {node.full_scale_counts}: its channels reach at most "
                 f"{limit}, so full_scale_ma is never reached; check the type of the channels"
             )
+    yield from _hum_warnings(deployment.daemon.sync_period_ms)
     yield from _mapping_warnings(deployment)
     yield from unchecked_items(deployment)
     for hand in deployment.hands:
@@ -101,6 +104,20 @@ def find_warnings(deployment: config.Deployment) -> Iterator[str]:
             alike.setdefault(text, []).append(entry.name)
     for text, pads in alike.items():
         yield f"{', '.join(pads)}: {text}"
+
+
+def _hum_warnings(period_ms: float) -> Iterator[str]:
+    """Warn where samples show the mains' hum as motion that is as slow as touches."""
+    rate_hz = 1e3 / period_ms
+    apparent_hz = {f: abs(f - rate_hz * round(f / rate_hz)) for f in MAINS_HZ}
+    slow = {f: at for f, at in apparent_hz.items() if at < MAX_TOUCH_HZ}
+    if slow:
+        seen = " and ".join(f"{f} Hz as {at:.3g} Hz" for f, at in slow.items())
+        longest_ms = 1e3 / (max(MAINS_HZ) + MAX_TOUCH_HZ)
+        yield (
+            f"[daemon]: sync_period_ms = {period_ms:g}: hum of the mains reads {seen}, as slow as touches, "
+            f"so it can't be told from them; periods up to {longest_ms:.0f} ms tell them apart"
+        )
 
 
 def _bus_warnings(deployment: config.Deployment, bus: config.Bus) -> Iterator[str]:

@@ -44,6 +44,8 @@ class FaultKind(StrEnum):
     HYSTERESIS_TAIL = "hysteresis_tail", "slowly fading remainder of a press"
     COMMON_DRIFT = "common_drift", "drift shared with other pads: temperature or supply"
     UNEXPLAINED = "unexplained", "static load or contacts that no known fault explains"
+    # diagnosed from the measured noise
+    NOISE = "noise", "hum or noise of the channels beyond what is stated"
     # diagnosed from serial numbers, the calibration and the excitation
     NODE_REPLACED = "node_replaced", "node with another serial number than before"
     GAINS_CHANGED = "gains_changed", "channel gains that no longer match the calibration"

@@ -2,7 +2,7 @@ cimport cython
 from handtouch.core.stages.receive cimport SampleMemory
 
 cdef Py_ssize_t _VALUES, _CLEAR, _TOUCHED, _STALE, _FAULTED, _STARTING, _MAX_SILENT
-cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _NAN
+cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _MAX_NEGATIVE_AMPLITUDES, _MAX_ZERO_FRACTION, _NAN
 
 cdef class ContactDetection:
     cdef Py_ssize_t pads, channels
@@ -19,8 +19,10 @@ cdef class ContactDetection:
     cdef long long[::1] next_contact_id, begin_ns, first_sample_ns, contradicting_samples
     cdef long long[::1] update_interval_ticks, ticks_per_hand_frame
     cdef double[::1] block_sum, block_squares, block_count, excess
-    cdef unsigned char[::1] saturated
-    cdef bint sampled, implausible, trusted, stale
+    cdef double[::1] span_sum, span_squares, span_count, span_low, span_crossings, span_level
+    cdef double[::1] disturbance, threshold_factor
+    cdef unsigned char[::1] saturated, known, span_above
+    cdef bint sampled, implausible, trusted, stale, zeroing, railed
     @cython.locals(pad=Py_ssize_t)
     cpdef detect_contacts(
         self, SampleMemory memory, const unsigned char[::1] node_state, long long sync_ns,
@@ -30,20 +32,22 @@ cdef class ContactDetection:
 cdef void _take_sample(
     ContactDetection stage, SampleMemory memory, Py_ssize_t pad, bint operational, long long sync_ns,
     long long previous_sync_ns, long long until_ns) noexcept
-@cython.locals(railed=bint, at_top=bint, touching=bint, began=bint, sources=bint, total=double,
-               magnitude=double, others=double, low=double, high=double, excess=double, least=double, c=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, count='long long')
+@cython.locals(railed=bint, at_top=bint, near_zero=bint, touching=bint, began=bint, total=double, magnitude=double,
+               others=double, excess=double, c=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, count='long long')
 cdef void _check_sample(ContactDetection stage, SampleMemory memory, Py_ssize_t pad) noexcept
+@cython.locals(sources=bint, drains=bint, excess=double, limit=double, c=Py_ssize_t)
+cdef bint _sources(ContactDetection stage, Py_ssize_t pad, double total, double magnitude) noexcept
 @cython.locals(period_ns='long long')
 cdef void _check_silence(
     ContactDetection stage, Py_ssize_t pad, long long cycle_ns, long long half_period_ns) noexcept
 @cython.locals(level=double, touching=bint, above=bint, debounce_ns='long long', elapsed_ns='long long')
 cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad, long long half_period_ns) noexcept
-@cython.locals(begin_a=double, end_a=double)
+@cython.locals(factor=double)
 cdef bint _is_above(ContactDetection stage, Py_ssize_t pad, double level, bint touching) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _begin_contact(ContactDetection stage, Py_ssize_t pad) noexcept
 cdef void _end_contact(ContactDetection stage, Py_ssize_t pad) noexcept
 @cython.locals(due=bint, framed=bint)
 cdef void _select(ContactDetection stage, Py_ssize_t pad, bint continued, bint above) noexcept
-@cython.locals(free=bint, c=Py_ssize_t, excess=double)
+@cython.locals(free=bint, above=bint, c=Py_ssize_t, i=Py_ssize_t, excess=double, total=double)
 cdef void _count_sample(ContactDetection stage, Py_ssize_t pad) noexcept

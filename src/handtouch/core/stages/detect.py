@@ -16,6 +16,8 @@ _VALUES = VALUE_COUNT
 _CLEAR, _TOUCHED, _STALE, _, _FAULTED, _STARTING, _ = map(int, PadState)
 _MAX_SILENT = MAX_SILENT_PERIODS
 _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02  # of a channel's noise, and of all channels
+_MAX_NEGATIVE_AMPLITUDES = 2.0  # of hum and noise
+_MAX_ZERO_FRACTION = 0.02  # of a channel's range: an amplifier's offset is less, if it isn't broken
 _NAN = float("nan")
 
 
@@ -70,8 +72,14 @@ class ContactDetection:
         # baseline
         self.held, self.block_sum = arrays["held"], arrays["block_sum"]
         self.block_squares, self.block_count = arrays["block_squares"], arrays["block_count"]
+        self.span_sum, self.span_squares = arrays["span_sum"], arrays["span_squares"]
+        self.span_low, self.span_count = arrays["span_low"], arrays["span_count"]
+        self.span_crossings, self.span_above = arrays["span_crossings"], arrays["span_above"]
+        self.span_level = arrays["span_level"]
+        self.disturbance, self.threshold_factor = arrays["disturbance"], arrays["threshold_factor"]
+        self.known = arrays["known"]
         # of one pad
-        self.sampled = self.implausible = self.trusted = self.stale = False
+        self.sampled = self.implausible = self.trusted = self.stale = self.zeroing = self.railed = False
         self.excess = arrays["excess"]
 
     def detect_contacts(
@@ -101,6 +109,8 @@ class ContactDetection:
                 self.pad_state[pad] = _FAULTED
             elif self.touching[pad]:
                 self.pad_state[pad] = _TOUCHED
+            elif self.zeroing:
+                self.pad_state[pad] = _STARTING
             elif self.pad_state[pad] <= _TOUCHED or self.contradicting_samples[pad] == 0:
                 self.pad_state[pad] = _CLEAR
             else:  # back with a current that may begin a contact
@@ -140,11 +150,9 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
 
     A firm contact near an electrode exceeds what its channel measures: the others then carry a contact's
     current, too. A pad that had a channel at the top at rest has a broken channel, also while it is touched.
-    A sheet only sinks current. If all channels source, by no more than begins a contact, the baseline is
-    wrong, not the pad: it was learned during a light touch.
     """
     railed, at_top, total, magnitude, others = False, False, 0.0, 0.0, 0.0
-    low = high = 0.0
+    near_zero = True
     for c in range(stage.channels):
         i, k = pad * stage.channels + c, pad * memory.channels + c
         count = memory.counts[k]
@@ -160,23 +168,37 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
         else:
             others += stage.currents[i]
         magnitude += abs(excess)
-        if c == 0 or excess < low:
-            low = excess
-        if c == 0 or excess > high:
-            high = excess
-    least = _MAX_NEGATIVE_SIGMA * stage.noise_counts[pad]
-    sources = low < -(_MAX_NEGATIVE_FRACTION * magnitude + least)
-    if sources:
-        sources = high > least or -total > stage.begin_threshold_a[pad]
+        if abs(excess) > _MAX_ZERO_FRACTION * memory.high_limits[k]:
+            near_zero = False
     if at_top:
         touching = stage.touching[pad] != 0
         began = touching or stage.pad_state[pad] != _FAULTED
         if not (began and _is_above(stage, pad, others, touching)):
             railed = True
-    stage.implausible = railed or sources
+    stage.railed, stage.zeroing = railed, False
+    stage.implausible = railed
+    if not railed and _sources(stage, pad, total, magnitude):
+        stage.zeroing = near_zero and stage.known[pad] == 0 and stage.touching[pad] == 0
+        stage.implausible = not stage.zeroing
     stage.trusted = not stage.implausible
     if stage.sampled:
         stage.total_current_a[pad] = total
+
+
+def _sources(stage: ContactDetection, pad: int, total: float, magnitude: float) -> bool:
+    """Return True if channels source current beyond noise, hum, and what a contact's own gains may do.
+
+    A sheet only sinks current. If all channels source, by no more than begins a contact, the baseline is
+    wrong, not the pad: it was learned during a light touch.
+    """
+    sources, drains = False, False
+    for c in range(stage.channels):
+        excess = stage.excess[c]
+        limit = _MAX_NEGATIVE_SIGMA * stage.noise_counts[pad]
+        limit = max(limit, _MAX_NEGATIVE_AMPLITUDES * stage.disturbance[pad * stage.channels + c])
+        drains |= excess > limit
+        sources |= excess < -(_MAX_NEGATIVE_FRACTION * magnitude + limit)
+    return sources and (drains or -total > stage.begin_threshold_a[pad] * stage.threshold_factor[pad])
 
 
 def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period_ns: int) -> None:
@@ -199,7 +221,7 @@ def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> N
     Times of SYNCs vary, so half a period less than the debounce is enough; one sample is not.
     """
     level, touching = stage.total_current_a[pad], stage.touching[pad] != 0
-    above = _is_above(stage, pad, level, touching)
+    above = _is_above(stage, pad, level, touching) and not stage.zeroing
     if touching and not stage.trusted:
         _end_contact(stage, pad)
     elif stage.sampled and stage.trusted and above != touching:
@@ -222,9 +244,10 @@ def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> N
 
 def _is_above(stage: ContactDetection, pad: int, level: float, touching: bool) -> bool:
     """Return True if a current is above the threshold that applies."""
-    begin_a: float = stage.begin_threshold_a[pad]
-    end_a: float = stage.end_threshold_a[pad]
-    return level >= end_a if touching else level > begin_a
+    factor: float = stage.threshold_factor[pad]
+    if touching:
+        return level >= factor * stage.end_threshold_a[pad]
+    return level > factor * stage.begin_threshold_a[pad]
 
 
 def _begin_contact(stage: ContactDetection, pad: int) -> None:
@@ -281,9 +304,23 @@ def _count_sample(stage: ContactDetection, pad: int) -> None:
     """Count a sample, and collect that of an untouched pad for its baseline, unless a contact may begin."""
     stage.sample_counts[pad] += 1
     free = stage.trusted and not stage.touching[pad]
-    if free and stage.total_current_a[pad] <= stage.begin_threshold_a[pad]:
-        for c in range(stage.channels):
-            excess = stage.excess[c]
-            stage.block_sum[pad * stage.channels + c] += excess
-            stage.block_squares[pad * stage.channels + c] += excess * excess
-        stage.block_count[pad] += 1.0
+    free = free and (stage.zeroing or not _is_above(stage, pad, stage.total_current_a[pad], False))
+    total = 0.0
+    for c in range(stage.channels):
+        i, excess = pad * stage.channels + c, stage.excess[c]
+        total += excess
+        if free:
+            stage.block_sum[i] += excess
+            stage.block_squares[i] += excess * excess
+        if not stage.railed:
+            stage.span_sum[i] += excess
+            stage.span_squares[i] += excess * excess
+    stage.block_count[pad] += 1.0 if free else 0.0
+    if not stage.railed:
+        if stage.span_count[pad] == 0.0 or total < stage.span_low[pad]:
+            stage.span_low[pad] = total
+        stage.span_count[pad] += 1.0
+        above = total > stage.span_level[pad]
+        if above != (stage.span_above[pad] != 0):
+            stage.span_crossings[pad] += 1.0
+            stage.span_above[pad] = above
