@@ -42,7 +42,7 @@ cdef void _check_silence(
     ContactDetection stage, Py_ssize_t pad, long long cycle_ns, long long half_period_ns) noexcept
 @cython.locals(level=double, touching=bint, above=bint, debounce_ns='long long', elapsed_ns='long long')
 cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad, long long half_period_ns) noexcept
-@cython.locals(factor=double)
+@cython.locals(factor=double, begin_a=double, end_a=double)
 cdef bint _is_above(ContactDetection stage, Py_ssize_t pad, double level, bint touching) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _begin_contact(ContactDetection stage, Py_ssize_t pad) noexcept

@@ -245,9 +245,9 @@ def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> N
 def _is_above(stage: ContactDetection, pad: int, level: float, touching: bool) -> bool:
     """Return True if a current is above the threshold that applies."""
     factor: float = stage.threshold_factor[pad]
-    if touching:
-        return level >= factor * stage.end_threshold_a[pad]
-    return level > factor * stage.begin_threshold_a[pad]
+    begin_a: float = stage.begin_threshold_a[pad]
+    end_a: float = stage.end_threshold_a[pad]
+    return level >= factor * end_a if touching else level > factor * begin_a
 
 
 def _begin_contact(stage: ContactDetection, pad: int) -> None:
