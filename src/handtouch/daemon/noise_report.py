@@ -64,4 +64,4 @@ class NoiseReport:
 def _measured(tick: TickProcessor) -> FloatArray:
     """Return the standard deviations of the channels (n, c), of hum at least."""
     baseline = tick.baseline
-    return np.maximum(baseline.noise_counts, baseline.disturbance / np.sqrt(2))
+    return np.asarray(np.maximum(baseline.noise_counts, baseline.disturbance / np.sqrt(2)))
