@@ -71,7 +71,7 @@ UNITS = {
 }
 NODE_FILE = "node file"
 SAME = {"hand.pad.touch": "touch"}
-KIND_TITLES = {"surface": "Surfaces", "pattern": "Shear patterns"}
+KIND_TITLES = {"surface": "Surfaces", "pattern": "Shear patterns", "source": "`[source.NAME]`"}
 KIND_ANCHORS = {"surface": "surfaces", "pattern": "shear-patterns"}
 TITLES = {"": "Keys before the first table", "trim file": "Trim file"}
 TYPES = {str: "text", bool: "`true`, `false`", int: "integer", float: "number"}
@@ -212,6 +212,9 @@ def _shipped() -> dict[tuple[str, str], Any]:
             entries = value if isinstance(value, list) else list(value.values()) if named else [value]
             if key in tables.KINDS:
                 add(value["kind"], value, {})
+            elif key in settings.KINDS and table == NODE_FILE:
+                for entry in value.values():
+                    add(entry["kind"], entry, {})
             elif path in names or named:
                 for entry in entries:
                     add(f"{path}.*" if named else path, entry, names)
@@ -219,7 +222,7 @@ def _shipped() -> dict[tuple[str, str], Any]:
 
     for path in sorted(CONFIG.glob("*.toml")):
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-        is_node = "adc" in content
+        is_node = "adc" in content or "source" in content
         add(
             NODE_FILE if is_node else "",
             content,
@@ -293,12 +296,13 @@ def _sections(models: Mapping[str, type[BaseModel]], prefix: str, lists: set[str
         yield from _rows(f"{prefix}.{name}".strip(".") if prefix else name, model)
 
 
-def _kinds(key: str) -> Iterator[str]:
+def _kinds(key: str, head: str, models: Mapping[str, type[BaseModel]]) -> Iterator[str]:
     yield f"\n### {KIND_TITLES[key]}\n"
-    yield f"`{key} = {{ kind = ... }}`: its other keys depend on `kind`.\n"
-    for kind, model in tables.KINDS[key].items():
+    yield f"{head}: its other keys depend on `kind`.\n"
+    for kind, model in models.items():
+        text = (model.__doc__ or "").strip().rpartition("`: ")[2]
         yield f'\n#### `kind = "{kind}"`\n'
-        yield f"{(model.__doc__ or '').strip()}\n"
+        yield f"{text[0].upper()}{text[1:]}\n"
         yield from _rows(kind, model)
 
 
@@ -307,10 +311,13 @@ def page() -> Iterator[str]:
     yield HEAD
     yield DEPLOYMENT.strip()
     yield from _sections(tables.TABLES, "", {"bus", "hand", "hand.pad"})
-    yield from _kinds("surface")
-    yield from _kinds("pattern")
+    for key, models in tables.KINDS.items():
+        yield from _kinds(key, f"`{key} = {{ kind = ... }}`", models)
     yield NODE
-    yield from _sections({**settings.TABLES, "trim file": settings.Trim}, NODE_FILE, {"pad"})
+    yield from _sections(settings.TABLES, NODE_FILE, {"pad"})
+    for key, models in settings.KINDS.items():
+        yield from _kinds(key, f"A table `[{key}.NAME]`, read instead of an ADC", models)
+    yield from _sections({"trim file": settings.Trim}, NODE_FILE, set())
 
 
 if __name__ == "__main__":

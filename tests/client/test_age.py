@@ -115,7 +115,7 @@ def test_a_backlog_never_counts_as_new(hand: handtouch.Hand, publisher: Any, clo
 
 @pytest.mark.parametrize("stated", [{"period_s": 0.2}, {"period_s": 0.005, "frame_period_s": 0.2}])
 def test_the_limit_is_three_periods_of_frames_as_service_states_them(
-    hand: handtouch.Hand, publisher: Any, clock: Clock, stated: dict[str, float]
+    hand: handtouch.Hand, publisher: Any, clock: Clock, stated: dict[str, Any]
 ) -> None:
     for seq in (2, 3, 4):  # frames of an overloaded daemon don't become fresh by being late
         assert hand.max_age_s == MIN_AGE_LIMIT_S

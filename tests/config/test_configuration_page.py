@@ -51,8 +51,10 @@ def sections() -> list[Any]:
         for name, model in models.items()
         if name != "hand.pad.touch"  # the keys of [touch]
     ]
-    kinds = ((kind, model) for models in KINDS.values() for kind, model in models.items())
-    return found + [pytest.param(DEPLOYMENT, f'kind = "{kind}"', model, id=kind) for kind, model in kinds]
+    for part, all_kinds in ((DEPLOYMENT, KINDS), (NODE, settings.KINDS)):
+        kinds = ((kind, model) for models in all_kinds.values() for kind, model in models.items())
+        found += [pytest.param(part, f'kind = "{kind}"', model, id=kind) for kind, model in kinds]
+    return found
 
 
 def test_the_page_is_current() -> None:

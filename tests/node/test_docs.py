@@ -27,6 +27,7 @@ def test_the_diagram_has_the_channels_gain_and_line_of_the_shipped_node() -> Non
     texts = [element.text for element in drawing.iter() if element.tag.endswith("text")]
     pad = load(ROOT / "config/touch_node.toml").settings.pads[0]
     assert set(pad.channels) <= set(texts)
+    assert pad.gain_ohm is not None
     assert any(str(text).startswith(f"{-pad.gain_ohm:g} Ω") for text in texts)
     assert pad.excitation is not None
     assert f"GPIO {pad.excitation.line}" in texts

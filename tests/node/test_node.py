@@ -115,7 +115,7 @@ def test_an_adc_without_time_stamps_is_used_and_that_is_reported(tmp_path: Path,
     bench.start()
     old.push(raw_of_ma([1.0] * 4), 0)
     assert bench.counts() == pytest.approx(counts_of_ma([1.0] * 4), abs=1)
-    assert "the driver has no time stamps" in bench.service.status()
+    assert "there are no time stamps" in bench.service.status()
     bench.service.close()
     old.close()
 

@@ -142,7 +142,8 @@ class _ValidationMistake:
         if self.error_type.startswith("union_tag"):
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
             at, value = (".kind", f" = {_format_input(given)}") if given is not None else ("", value)
-            kinds = self.kinds[self.key]
+            at = at if self.key_path else at.replace(".", ": ")
+            kinds = self.kinds[_kind_table(self.path, self.kinds)]
             hint = suggest_name(str(given), list(kinds))
             remedy = f"{hint}needs {_join_alternatives(f'kind = {_format_input(kind)}' for kind in kinds)}"
             return Problem(self.location + at, value, remedy)
@@ -225,24 +226,32 @@ def _locate(
             elif shown:
                 shown[-1] += f"[{step}]"
             continue
-        if step == "[key]" or (isinstance(here, dict) and here.get("kind") == step and path[-1] in kinds):
+        is_kind = isinstance(here, dict) and here.get("kind") == step and _kind_table(path, kinds)
+        if step == "[key]" or is_kind:
             continue  # pydantic's own marks, not keys of the file
         if isinstance(here, dict):
             table = here
             here = here.get(step)
         path.append(step)
         shown.append(step)
+    if not section and isinstance(here, dict) and path[:-1] == [_kind_table(path[:-1], kinds)]:
+        section, shown = f"[{'.'.join(path)}]", []  # a table as a whole, such as [source.NAME]
     if not section and len(shown) > 1:
         section, shown = f"[{'.'.join(shown[:-1])}]", shown[-1:]
     return path, section, ".".join(shown), table
+
+
+def _kind_table(path: list[str], kinds: Mapping[str, Tables]) -> str:
+    """Return the name of the table of several kinds at a path, such as surface or source.NAME; else ""."""
+    return next((name for name in reversed(path[-2:]) if name in kinds), "")
 
 
 def _table_model(
     path: list[str], table: Mapping[str, Any], tables: Tables, kinds: Mapping[str, Tables]
 ) -> type[BaseModel] | None:
     """Return the model of the table at a path."""
-    if path and path[-1] in kinds:
-        return kinds[path[-1]].get(str(table.get("kind")))
+    if name := _kind_table(path, kinds):
+        return kinds[name].get(str(table.get("kind")))
     return tables.get(".".join(path)) or tables.get(".".join([*path[:-1], "*"]))
 
 

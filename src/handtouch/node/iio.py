@@ -53,7 +53,7 @@ class AdcReader(Protocol):
 
     @property
     def millivolts(self) -> tuple[FloatArray, FloatArray]:
-        """Scale (channels,) [mV] and offset (channels,) [raw]: mV = (raw + offset) scale."""
+        """Scale (channels,) [mV] and offset (channels,) [raw]: mV = (raw + offset) scale; 1 and 0 without."""
 
     def open(self) -> None: ...
 
@@ -62,6 +62,9 @@ class AdcReader(Protocol):
     def drain(self) -> None: ...
 
     def close(self) -> None: ...
+
+    def describe(self) -> str:
+        """Return what the log tells of it besides its timing; empty for nothing."""
 
 
 class IioDevice:
@@ -202,6 +205,10 @@ class OneShotReader:
 
     def close(self) -> None:
         """Do nothing: no file is open."""
+
+    def describe(self) -> str:
+        """Return nothing."""
+        return ""
 
 
 def _find(name: str, iio: Path, pattern: str) -> Path:

@@ -35,9 +35,7 @@ class PadInput:
         self, pad: NodePad, trim: Trim, columns: list[int], node: UnconfiguredDevice | None = None
     ) -> None:
         self.pad, self.columns, self._node = pad, columns, node
-        self._volt_per_unit = np.array(
-            [1.0 if channel.startswith("current") else pad.gain_ohm for channel in pad.channels]
-        )
+        self._ma_per_unit = np.array([pad.ma_per_unit_of(channel) for channel in pad.channels])
         count = len(pad.channels)
         self._gain, self._offset_ma = np.array(trim.gain or (1.0,) * count), np.zeros(count)
         if trim.offset_ma is not None:
@@ -65,9 +63,9 @@ class PadInput:
     def currents_ma(self, raw: FloatArray, scale: FloatArray, offset: FloatArray) -> FloatArray:
         """Return the currents (..., c) [mA] of raw values (..., c).
 
-        `scale`, `offset` : of the channels (c,), to mV as in IIO, or to mA for channels currentN
+        `scale`, `offset` : of the channels (c,), to mV as in IIO, to mA for channels currentN, or 1 and 0
         """
-        measured = (raw + offset) * scale / self._volt_per_unit
+        measured = (raw + offset) * scale * self._ma_per_unit
         return np.asarray((measured - self._offset_ma) * self._gain)
 
     def counts(self, currents_ma: FloatArray) -> NDArray[np.int64]:

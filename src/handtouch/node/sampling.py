@@ -1,4 +1,4 @@
-"""Sampling of all ADCs at SYNC: counts of every pad, timing, failures and recovery.
+"""Sampling of all ADCs and other sources at SYNC: counts of every pad, timing, failures and recovery.
 
 Public names: `AdcInput`, `Sampling`, `SampleTiming`, `make_inputs`.
 """
@@ -48,7 +48,7 @@ class TimingSummary:
         )
         text = f"sampled {mean:+.2f} ms from SYNC, jitter {jitter:.2f} ms ({first:+.2f} to {last:+.2f})"
         text += f", channels within {span:.2f} ms" if span >= 0.005 else ""
-        return text + ("" if self.is_timed else ", times of reading: the driver has no time stamps")
+        return text + ("" if self.is_timed else ", times of reading, as there are no time stamps")
 
 
 class SampleTiming:
@@ -82,7 +82,7 @@ class SampleTiming:
 
 
 class AdcInput:
-    """One ADC with the pads connected to it; a failure closes it; reopened after growing delays.
+    """One ADC, or another source, with its pads; a failure closes it; it is reopened after growing delays.
 
     `rows` : of its pads in the counts of all; `failures` : failed samples; `timing` : of its samples
     """
@@ -136,6 +136,10 @@ class AdcInput:
             self._reader.drain()
         except AdcError as error:
             self._fail(error, now_ns)
+
+    def describe(self) -> str:
+        """Return what the reader tells of itself; empty for nothing."""
+        return self._reader.describe()
 
     def close(self) -> None:
         """Close the ADC."""
@@ -201,21 +205,36 @@ def make_inputs(
     nodes: Sequence[UnconfiguredDevice | None],
     clock: Callable[[], int] = time.monotonic_ns,
 ) -> list[AdcInput]:
-    """Return the ADCs that pads are connected to, with these pads, each with its node; opens no file."""
+    """Return ADCs and other sources that pads have, with these pads, each with its node; opens no file."""
     settings, inputs = file.settings, []
     for name, adc in settings.adcs.items():
         rows = [row for row, pad in enumerate(settings.pads) if pad.adc == name]
-        channels: list[str] = []
-        pads = []
-        for row in rows:
-            own = settings.pads[row].channels
-            columns = list(range(len(channels), len(channels) + len(own)))
-            pads.append(PadInput(settings.pads[row], file.trims[row], columns, nodes[row]))
-            channels += own
+        pads, channels = _connect(file, rows, nodes)
         if rows:
             reader = _make_reader(adc, channels, Path(settings.sysfs), Path(settings.devices), clock)
             inputs.append(AdcInput(name, reader, pads, rows))
+    for name, source in settings.sources.items():
+        rows = [row for row, pad in enumerate(settings.pads) if pad.source == name]
+        for group in [rows] if source.is_shared and rows else [[row] for row in rows]:
+            pads, channels = _connect(file, group, nodes)
+            reader = source.make_reader(channels, file.folder, clock)
+            shown = name if source.is_shared else f"{name} of {pads[0].pad.name}"
+            inputs.append(AdcInput(shown, reader, pads, group))
     return inputs
+
+
+def _connect(
+    file: NodeFile, rows: Sequence[int], nodes: Sequence[UnconfiguredDevice | None]
+) -> tuple[list[PadInput], list[str]]:
+    """Return the pads of these rows, and the channels of all of them in the order of a reading's columns."""
+    channels: list[str] = []
+    pads = []
+    for row in rows:
+        pad = file.settings.pads[row]
+        columns = list(range(len(channels), len(channels) + len(pad.channels)))
+        pads.append(PadInput(pad, file.trims[row], columns, nodes[row]))
+        channels += pad.channels
+    return pads, channels
 
 
 def _make_reader(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.port import open_bus
-from handtouch.canbus.bus.receivers import clock_offset_ns
+from handtouch.canbus.bus.receivers import arrival_ns
 from handtouch.device import DeviceBus, UnconfiguredDevice
 from handtouch.host.realtime import apply_realtime_settings
 from handtouch.host.systemd import ServiceWatchdog, SystemdNotifier
@@ -36,7 +36,6 @@ _REPORT_PERIOD_NS = 60_000_000_000
 _MAX_WAIT_S = 0.02
 _MAX_FRAMES = 1000  # handled at a time
 _RETRY_S = 0.1  # between attempts on a failing bus
-_MAX_STAMP_AGE_NS = 1_000_000_000  # age of a SYNC's stamp; an older one is of another clock
 
 _log = logging.getLogger("handtouch.node")
 
@@ -101,7 +100,7 @@ class NodeService:
             if number in syncs[:-1]:
                 continue
             now_ns = self._clock()
-            self.sampling.sync_ns = self._arrival_ns(frame, now_ns) if _is_sync(frame) else None
+            self.sampling.sync_ns = arrival_ns(frame, now_ns) if _is_sync(frame) else None
             self.devices.handle_frame(frame, now_ns)
             self.sampling.sync_ns = None
             self.devices.advance(self._clock())  # a flood of frames must not delay heartbeats
@@ -115,9 +114,7 @@ class NodeService:
             faults = ", ".join(kind.text for kind in pad.faults)
             parts.append(f"{pad.pad.name} {state}" + (f" ({faults})" if faults else ""))
         for adc in self.sampling.adcs:
-            summary = adc.timing.summary()
-            if summary is not None:
-                parts.append(f"{adc.name}: {summary}")
+            parts += [f"{adc.name}: {text}" for text in (adc.timing.summary(), adc.describe()) if text]
         if self.missed_syncs:
             parts.append(f"{self.missed_syncs} SYNCs missed in pauses")
         return "; ".join(parts)
@@ -180,11 +177,6 @@ class NodeService:
             return
         self._excited[name] = on
         pad.record_excitation()
-
-    def _arrival_ns(self, frame: can.Message, now_ns: int) -> int:
-        """Return the kernel's receive stamp on the monotonic clock, or `now_ns` without a usable one."""
-        arrival_ns = round(frame.timestamp * 1e9) + clock_offset_ns()
-        return arrival_ns if 0 <= now_ns - arrival_ns <= _MAX_STAMP_AGE_NS else now_ns
 
     def _report_bus(self, error: Exception | None) -> None:
         if (error is not None) is self._bus_failed:

@@ -6,11 +6,12 @@ Public names: `load`, `json_schema`, `NodeFile`, `TouchNode` and its tables.
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, Union
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -19,11 +20,20 @@ from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
 from handtouch.config.tables import Name, NodeId, Positive
 from handtouch.config.toml_text import parse_toml, read_text
 from handtouch.device.inputs import MAX_CHANNELS, MIN_CHANNELS
+from handtouch.node.source import Source
+from handtouch.node.source_kinds import source_kinds
 
-Channel = Annotated[str, Field(pattern=r"^(voltage|current)\d+(-(voltage|current)\d+)?$")]
+_IIO_CHANNEL = re.compile(r"(voltage|current)\d+(-(voltage|current)\d+)?")
+Channel = Annotated[str, Field(min_length=1, max_length=200)]
 PadChannels = Annotated[
     tuple[Channel, ...], Field(strict=False, min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)
 ]
+KINDS: Mapping[str, Tables] = {"source": source_kinds()}
+"""Models of tables that follow one of several, by `kind`"""
+if TYPE_CHECKING:
+    AnySource = Source
+else:
+    AnySource = Annotated[Union[tuple(KINDS["source"].values())], Field(discriminator="kind")]  # noqa: UP007
 PerChannel = Annotated[tuple[float, ...], Field(strict=False)]
 Serial = Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 _Model = TypeVar("_Model", bound=Table)
@@ -118,14 +128,26 @@ class NodePad(Table):
     serial: Serial | None = Field(
         None, description="serial number, 0x1018 sub 4; default: a random one, kept in the state file"
     )
-    adc: str = Field(description="name of its [adc.NAME]")
-    channels: PadChannels = Field(
-        description="IIO channels of 0x6401:01 and those after it, one for each electrode (3 to 16), e.g. "
-        "voltage0, or voltage0-voltage1 (differential)"
+    adc: str | None = Field(None, description="name of its [adc.NAME]", examples=["main"])
+    source: str | None = Field(
+        None, description="name of its [source.NAME], instead of an ADC", examples=["board"]
     )
-    gain_ohm: float = Field(
-        description="volts at the ADC per ampere into the electrode, negative for an inverting amplifier; "
-        "ignored for channels currentN"
+    channels: PadChannels = Field(
+        description="channels of 0x6401:01 and those after it, one for each electrode (3 to 16). Of an ADC: "
+        "IIO channels, e.g. voltage0, or voltage0-voltage1 (differential); of lines: the value's number, "
+        "or its label; of a DBC file: SIGNAL or MESSAGE.SIGNAL"
+    )
+    gain_ohm: float | None = Field(
+        None,
+        description="of an ADC: volts at it per ampere into the electrode, negative for an inverting "
+        "amplifier; not needed for channels currentN",
+        examples=[-240.0],
+    )
+    ma_per_unit: float | None = Field(
+        None,
+        description="of another source: milliamperes into the electrode per unit of its values, negative "
+        "where they fall with the current",
+        examples=[0.0204],
     )
     full_scale_ma: Positive = Field(10.0, description="current at count 32767, as in the deployment")
     trim: str | None = Field(
@@ -144,16 +166,33 @@ class NodePad(Table):
     def _check_values(self) -> Self:
         if self.gain_ohm == 0:
             raise ValueError("gain_ohm must not be 0: it is the feedback resistance of the amplifiers")
+        if self.ma_per_unit == 0:
+            raise ValueError("ma_per_unit must not be 0: it is the current per unit of the values")
+        if (self.adc is None) == (self.source is None):
+            raise ValueError("give either adc or source: the name of an [adc.NAME] or a [source.NAME]")
         if len(set(self.channels)) < len(self.channels):
             raise ValueError("channels must be different ones")
         return self
+
+    def ma_per_unit_of(self, channel: str) -> float:
+        """Return the milliamperes per unit of a channel's values: mV of an ADC, else the source's unit."""
+        if self.source is not None:
+            return self.ma_per_unit or 1.0
+        return 1.0 if channel.startswith("current") else 1.0 / (self.gain_ohm or 1.0)
 
 
 class TouchNode(Table):
     """File of `handtouch node`."""
 
     bus: CanInterface
-    adcs: dict[Name, Adc] = Field(alias="adc", min_length=1, description="[adc.NAME] tables")
+    adcs: dict[Name, Adc] = Field(
+        default_factory=dict, alias="adc", description="[adc.NAME] tables: ADCs of this computer"
+    )
+    sources: dict[Name, AnySource] = Field(
+        default_factory=dict,
+        alias="source",
+        description="[source.NAME] tables: lines of numbers, CAN frames, or what a package of yours reads",
+    )
     pads: Annotated[tuple[NodePad, ...], Field(strict=False)] = Field(
         alias="pad", min_length=1, max_length=127, description="[[pad]] tables"
     )
@@ -197,15 +236,17 @@ class NodeFile:
     settings: TouchNode
     trims: tuple[Trim, ...]
     state: Path
+    folder: Path
+    """that paths in it are relative to"""
 
 
 def load(path: Path) -> NodeFile:
     """Read and check the file of a node and its trim files. Raises ConfigError with every error."""
     settings = _read(path, TouchNode, TABLES)
-    if problems := tuple(_problems_in(settings)):
+    if problems := tuple(_problems_in(settings, path.parent)):
         raise ConfigError(str(path), problems)
     trims = tuple(_read_trim(path.parent, pad) for pad in settings.pads)
-    return NodeFile(settings, trims, _state_path(path, settings))
+    return NodeFile(settings, trims, _state_path(path, settings), path.parent)
 
 
 def json_schema() -> dict[str, Any]:
@@ -219,7 +260,7 @@ def _read(path: Path, model: type[_Model], tables: Tables) -> _Model:
     try:
         return model.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(str(path), problems_of(raw, error, tables, {})) from error
+        raise ConfigError(str(path), problems_of(raw, error, tables, KINDS)) from error
 
 
 def _read_trim(folder: Path, pad: NodePad) -> Trim:
@@ -236,7 +277,7 @@ def _read_trim(folder: Path, pad: NodePad) -> Trim:
     return trim
 
 
-def _problems_in(settings: TouchNode) -> Iterator[Problem]:
+def _problems_in(settings: TouchNode, folder: Path) -> Iterator[Problem]:
     """Yield the errors that several tables make together."""
     for name, adc in settings.adcs.items():
         if adc.mode == "one-shot":
@@ -252,16 +293,14 @@ def _problems_in(settings: TouchNode) -> Iterator[Problem]:
                 f" = {adc.buffer_scans}",
                 f"holds less than {_MAX_DRAIN_PERIOD_S:g} s at that rate_hz; give at least {need}",
             )
-    used: set[tuple[str, str]] = set()
+    used: set[tuple[str | None, str | None, str]] = set()
     for number, pad in enumerate(settings.pads, 1):
         section = f'[[pad]] {number} "{pad.name}"'
-        if pad.adc not in settings.adcs:
-            known = ", ".join(settings.adcs)
-            yield Problem(f"{section}: adc", f" = {pad.adc}", f"there is no [adc.{pad.adc}]; known: {known}")
+        yield from _problems_of_input(settings, pad, section, folder)
         for channel in pad.channels:
-            if (pad.adc, channel) in used:
+            if (pad.adc, pad.source, channel) in used:
                 yield Problem(f"{section}: channels", f" = {channel}", "another pad has this channel")
-            used.add((pad.adc, channel))
+            used.add((pad.adc, pad.source, channel))
     for key in ("name", "node_id", "serial"):
         given = Counter(getattr(pad, key) for pad in settings.pads)
         for value, count in given.items():
@@ -269,6 +308,31 @@ def _problems_in(settings: TouchNode) -> Iterator[Problem]:
                 yield Problem(
                     f"[[pad]]: {key}", f" = {value}", f"is given {count} times; each pad needs its own"
                 )
+
+
+def _problems_of_input(settings: TouchNode, pad: NodePad, section: str, folder: Path) -> Iterator[Problem]:
+    """Yield the errors of a pad's ADC or source, its channels and their unit."""
+    table, name = ("adc", pad.adc) if pad.source is None else ("source", pad.source)
+    known = settings.adcs if pad.source is None else settings.sources
+    if name not in known:
+        names = ", ".join(known) or "none"
+        yield Problem(f"{section}: {table}", f" = {name}", f"there is no [{table}.{name}]; known: {names}")
+        return
+    source = settings.sources.get(pad.source or "")
+    for channel in pad.channels:
+        if source is not None:
+            problem = source.problem_of(channel, folder)
+        else:
+            problem = "" if _IIO_CHANNEL.fullmatch(channel) else "must be an IIO channel such as voltage0"
+        if problem:
+            yield Problem(f"{section}: channels", f" = {channel}", problem)
+    is_current = all(channel.startswith("current") for channel in pad.channels)
+    needed, other = ("gain_ohm", "ma_per_unit") if source is None else ("ma_per_unit", "gain_ohm")
+    if getattr(pad, needed) is None and not (source is None and is_current):
+        yield Problem(f"{section}: {needed}", "", f"is missing; {NodePad.model_fields[needed].description}")
+    if getattr(pad, other) is not None:
+        given = f" = {getattr(pad, other):g}"
+        yield Problem(f"{section}: {other}", given, f"write {needed} for a [{table}.{name}]")
 
 
 def _state_path(path: Path, settings: TouchNode) -> Path:

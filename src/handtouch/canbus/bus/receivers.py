@@ -51,6 +51,7 @@ _MAX_CONSECUTIVE_ERRORS = 20
 """Reopening loses the waiting frames; a few bad datagrams or lines don't justify it."""
 _SO_RCVBUFFORCE = 33
 _DISCONNECTED_ERRNOS = frozenset({errno.ENODEV, errno.ENXIO, errno.EBADF})  # the socket is unusable
+_MAX_STAMP_AGE_NS = 1_000_000_000  # of a frame; an older stamp is of another clock
 _MAX_CLOCK_READ_NS = 5_000
 
 # Unlike os.eventfd_write these keep the GIL, so no other thread runs in the middle of a burst.
@@ -130,6 +131,12 @@ def clock_offset_ns() -> int:
         if after - before < _MAX_CLOCK_READ_NS:
             break
     return (before + after) // 2 - wall
+
+
+def arrival_ns(frame: can.Message, now_ns: int) -> int:
+    """Return a frame's kernel stamp on the monotonic clock; `now_ns` without one, or if it is of another."""
+    stamp_ns = round(frame.timestamp * 1e9) + clock_offset_ns()
+    return stamp_ns if 0 <= now_ns - stamp_ns <= _MAX_STAMP_AGE_NS else now_ns
 
 
 class QueuedReceiver:

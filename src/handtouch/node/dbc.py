@@ -1,0 +1,224 @@
+"""Raw CAN frames described by a DBC file, for hands whose sensors speak CAN but not CANopen.
+
+Public names: `DbcSource`, `DbcReader`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
+
+import can
+import numpy as np
+from pydantic import Field
+
+from handtouch.canbus.bus.port import BusError, open_bus
+from handtouch.canbus.bus.receivers import arrival_ns
+from handtouch.config.problems import suggest_name
+from handtouch.config.tables import Bus
+from handtouch.node.adc_fault import AdcError, AdcFaultKind
+from handtouch.node.iio import AdcReading, FloatArray
+from handtouch.node.source import Source
+
+if TYPE_CHECKING:
+    from cantools.database import Database, Message, Signal
+
+_MAX_FRAMES = 1000  # read at a time
+_MAX_SPAN_PERIODS = 0.5
+"""Between the frames of one sample: more is a frame of the sample before, where one was lost"""
+
+
+class DbcSource(Source):
+    """`[source.NAME]` with `kind = "dbc"`: signals of CAN frames. Each pad has a socket of its own."""
+
+    is_shared: ClassVar[bool] = False
+
+    kind: Literal["dbc"] = Field(description="signals of CAN frames, as a DBC file describes them")
+    file: str = Field(
+        min_length=1,
+        description="DBC file (or KCD, SYM, ARXML), relative to this one",
+        examples=["hand.dbc"],
+    )
+    interface: str = Field("socketcan", description="python-can interface of the hand's bus")
+    channel: str | int = Field(description="python-can channel", examples=["can1"])
+    options: dict[str, str | int | float | bool] = Field(
+        default_factory=dict,
+        description="further options of python-can's interface",
+        examples=[{"port": 43114}],
+    )
+
+    def problem_of(self, channel: str, folder: Path) -> str:
+        """Return why a pad can't have this channel; empty if it can."""
+        try:
+            _find_signal(_load_database(folder / self.file), channel)
+        except (ImportError, OSError, ValueError) as error:
+            return str(error)
+        return ""
+
+    def make_reader(self, channels: Sequence[str], folder: Path, clock: Callable[[], int]) -> DbcReader:
+        """Return a reader of these signals."""
+        return DbcReader(self, channels, folder / self.file, clock)
+
+
+@lru_cache
+def _load_database(path: Path) -> Database:
+    """Load a file. Raises ImportError, OSError and ValueError with the remedy."""
+    try:
+        import cantools
+    except ImportError as error:
+        raise ImportError(
+            "needs cantools: pip install cantools, or handtouch with the extra `dbc`"
+        ) from error
+    try:
+        return cantools.database.load_file(path, strict=True)  # type: ignore[return-value]
+    except OSError as error:
+        raise OSError(f"file {path}: {error.strerror}; give the path of the DBC file") from error
+    except cantools.Error as error:
+        raise ValueError(f"file {path}: {str(error).splitlines()[0]}") from error
+
+
+def _find_signal(database: Database, channel: str) -> tuple[Message, Signal]:
+    """Return the signal of a name SIGNAL or MESSAGE.SIGNAL. Raises ValueError."""
+    message_name, _, name = channel.rpartition(".")
+    found = [
+        (message, signal)
+        for message in database.messages
+        for signal in message.signals
+        if signal.name == name and message_name in ("", message.name)
+    ]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = ", ".join(f"{message.name}.{name}" for message, _ in found)
+        raise ValueError(f"several messages have it: give one of {names}")
+    known = [f"{message.name}.{signal.name}" for message in database.messages for signal in message.signals]
+    shown = ", ".join(known[:8]) + (f" and {len(known) - 8} more" if len(known) > 8 else "")
+    raise ValueError(f"{suggest_name(channel, known)}the file has {shown or 'no signal'}")
+
+
+class DbcReader:
+    """Reads the signals of one pad: a sample is complete when each of their messages has come since the last.
+
+    Times are the kernel's receive stamps. `malformed_frames`: of a known identifier and no such signals.
+    Implements `AdcReader`.
+    """
+
+    def __init__(
+        self, source: DbcSource, channels: Sequence[str], path: Path, clock: Callable[[], int]
+    ) -> None:
+        self._source, self._path, self._clock = source, path, clock
+        self._channels = tuple(channels)
+        self.limits = source.limit_rows(channels)
+        self.millivolts = np.ones(len(channels)), np.zeros(len(channels))
+        self.samples = self.malformed_frames = 0
+        self._bus: can.BusABC | None = None
+        self._messages: dict[tuple[int, bool], Message] = {}
+        self._places: dict[tuple[int, bool], list[tuple[int, str]]] = {}
+        self._values = np.zeros(len(channels))
+        self._stamps_ns: dict[tuple[int, bool], int] = {}
+        self._newest: tuple[FloatArray, int, int] | None = None
+        self._sample_ns = 0
+
+    def open(self) -> None:
+        """Open the bus with a filter for the pad's messages. Raises AdcError."""
+        database = _load_database(self._path)
+        self._messages.clear()
+        self._places.clear()
+        for row, channel in enumerate(self._channels):
+            message, signal = _find_signal(database, channel)
+            key = message.frame_id, message.is_extended_frame
+            self._messages[key] = message
+            self._places.setdefault(key, []).append((row, signal.name))
+            if self._source.limits is None:
+                self.limits[row] = _signal_limits(signal)
+        source = self._source
+        try:
+            self._bus = open_bus(
+                Bus(name="source", interface=source.interface, channel=source.channel, options=source.options)
+            )
+        except BusError as error:
+            raise AdcError(AdcFaultKind.FILE_MISSING, str(error)) from error
+        if source.interface == "socketcan":  # in the kernel; elsewhere `recv` ends at a frame that it filters
+            filters: Any = [
+                {"can_id": number, "can_mask": 0x1FFFFFFF if extended else 0x7FF, "extended": extended}
+                for number, extended in self._messages
+            ]
+            self._bus.set_filters(filters)
+        self._stamps_ns.clear()
+        self._newest, self._sample_ns = None, self._clock()
+
+    def read(self) -> AdcReading | None:
+        """Return the newest sample if there is a new one. Raises AdcError after a silence."""
+        self.drain()
+        now_ns = self._clock()
+        if self._newest is not None:
+            (values, sample_ns, span_ns), self._newest = self._newest, None
+            return AdcReading(values, sample_ns, span_ns)
+        if now_ns - self._sample_ns <= self._source.max_silence_ns:
+            return None
+        missing = [message.name for key, message in self._messages.items() if key not in self._stamps_ns]
+        text = f"{self._source.channel}: no frame {', '.join(missing)} for "
+        text += f"{self._source.max_silence_ns / 1e6:g} ms"
+        text += f"; {self.malformed_frames} frames had another length" if self.malformed_frames else ""
+        raise AdcError(AdcFaultKind.NO_CONVERSION, text)
+
+    def drain(self) -> None:
+        """Read the frames that have arrived. Raises AdcError."""
+        if self._bus is None:
+            return
+        try:
+            for _ in range(_MAX_FRAMES):
+                frame = self._bus.recv(0.0)
+                if frame is None:
+                    return
+                self._take(frame)
+        except (can.CanError, OSError) as error:
+            raise AdcError(AdcFaultKind.READ_FAILED, f"{self._source.channel}: {error}") from error
+
+    def close(self) -> None:
+        """Close the bus."""
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+    def describe(self) -> str:
+        """Return the samples so far, for the log."""
+        return f"{self.samples} samples, {self.malformed_frames} malformed frames"
+
+    def _take(self, frame: can.Message) -> None:
+        key = frame.arbitration_id, frame.is_extended_id
+        message = self._messages.get(key)
+        if message is None or frame.is_error_frame or frame.is_remote_frame:
+            return
+        try:
+            decoded: Any = message.decode(bytes(frame.data), decode_choices=False)
+            found = [(row, float(decoded[name])) for row, name in self._places[key] if name in decoded]
+        except Exception:  # noqa: BLE001 - cantools and bitstruct raise several kinds for short frames
+            self.malformed_frames += 1
+            return
+        for row, value in found:  # a multiplexed signal comes in another frame of this message
+            self._values[row] = value
+        self._stamps_ns[key] = last_ns = arrival_ns(frame, self._clock())
+        oldest_ns = last_ns - round(_MAX_SPAN_PERIODS * 1e9 / self._source.rate_hz)
+        self._stamps_ns = {
+            key: stamp_ns for key, stamp_ns in self._stamps_ns.items() if stamp_ns >= oldest_ns
+        }
+        if len(self._stamps_ns) < len(self._messages):
+            return
+        first_ns = min(self._stamps_ns.values())
+        self._newest = self._values.copy(), last_ns, last_ns - first_ns
+        self._sample_ns = self._clock()
+        self._stamps_ns.clear()
+        self.samples += 1
+
+
+def _signal_limits(signal: Signal) -> tuple[float, float]:
+    """Return the ends of a signal's range, in its unit."""
+    if signal.is_float:
+        return -np.inf, np.inf
+    bits = signal.length
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    ends = sorted(float(cast("float", signal.raw_to_scaled(end, False))) for end in (low, high))
+    return ends[0], ends[1]
