@@ -81,6 +81,8 @@ export interface Contact extends Envelope {
     base_position_m?: number[];
     base_normal?: number[];
     base_covariance_m2?: number[];
+    /** the same while it is followed by nearness */
+    id?: number;
   }[];
   /** false while samples are missing: values of the last sample; absent where true */
   fresh?: boolean;

@@ -81,6 +81,7 @@ void print_parts(const std::vector<handtouch::ContactPart>& parts) {
         print_vectors("", part.in_link);
         print_vectors("palm_", part.in_palm);
         print_vectors("base_", part.in_base);
+        field("id", part.id);
         std::putchar('}');
         separator = ",";
     }

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline
-from handtouch.core.contact_solver import VALUE_SLICES, make_solver
+from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, VALUE_SLICES, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
@@ -255,7 +255,8 @@ class TickProcessor:
         """Discard the contact values of these pads, because what they are computed from changed."""
         held = self.state
         held.solved[pads] = False
-        held.values[pads] = held.parts[pads] = np.nan
+        held.values[pads] = np.nan
+        held.parts[pads, : PART_SLICES["newest_id"].start] = held.parts[pads, PART_COUNT:] = np.nan
         held.uncompensated_force_n[pads] = np.nan
         self.shear.discard(pads)
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip

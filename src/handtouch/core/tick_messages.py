@@ -424,7 +424,7 @@ def _contact_layout(
 def _number_row(state: TickState, name: str, absent: int, place: tuple[str, str, slice]) -> tuple[int, ...]:
     condition, array, at = place
     first, step, count = state.number_of(array), getattr(state, array)[0].size, at.stop - at.start
-    kind = "covariance" if name == "covariance_m2" else "numbers"
+    kind = {"covariance_m2": "covariance", "id": "whole"}.get(name, "numbers")
     step = _PART_STEPS.get(array, step)
     return _KIND[kind], _CONDITION[condition], absent, first + at.start, step, count if count > 1 else 0
 

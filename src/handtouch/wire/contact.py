@@ -59,6 +59,9 @@ class ContactPart:
     """outward unit normal, in the base's frame"""
     base_covariance_m2: Matrix3 | None = None
     """covariance of `base_position_m`, row by row"""
+    id: int = 0
+    """of this one among all that the pad has had: the same while it is followed by nearness, also through
+    samples in which the currents show one contact only. Both keep their order, too"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +171,10 @@ class Contact:
     base_force_vector_n: Vector3 | None = None
     """the force in the base's frame"""
     parts: Annotated[tuple[dict[str, Any], ...], tuple[ContactPart, ...]] = ()
-    """two contacts, in no order, where the currents of a pad of six or more electrodes support two, not
-    one, at the sheet's `pair_false_alarm`; then `position_m` and `force_n` are those of one contact that
-    replaces both, and `position_status` isn't `valid`; absent otherwise"""
+    """two contacts, each in the place of the one before that was nearest, where the currents of a pad of
+    six or more electrodes support two, not one, at the sheet's `pair_false_alarm`; then `position_m` and
+    `force_n` are those of one contact that replaces both, and `position_status` isn't `valid`; absent
+    otherwise"""
     mount_covariance_m2: Matrix3 | None = None
     """part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
     the pad, so that the difference of two positions has the rest"""

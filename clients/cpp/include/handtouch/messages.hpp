@@ -35,6 +35,7 @@ struct Place {
 struct ContactPart {
     Place in_link, in_palm, in_base;  // their statuses are those of the contact
     std::optional<double> force_n, force_std_n;
+    std::int64_t id = 0;  // the same while it is followed by nearness
 };
 
 // `contact/<hand>/<link>`: begin, update or end of one contact. Fields as in docs/wire.md.
@@ -260,6 +261,7 @@ inline Contact decode_contact(std::string_view payload) {
             read.in_base.status = made.in_base.status;
             read.force_n = detail::maybe(part.find("force_n"));
             read.force_std_n = detail::maybe(part.find("force_std_n"));
+            if (const Value* id = part.find("id")) read.id = id->as_int();
             made.parts.push_back(read);
         }
     return made;

@@ -141,7 +141,7 @@ def _part_values(part: Mapping[str, Any]) -> list[float]:
     """Return the values of the fields of `ros.RosContactPart`, in their order; `part` is a
     `wire.ContactPart`."""
     values = [*_vectors(part, ""), _number(part["force_n"]), _number(part["force_std_n"])]
-    return [*values, *_vectors(part, "palm_"), *_vectors(part, "base_")]
+    return [*values, *_vectors(part, "palm_"), *_vectors(part, "base_"), part.get("id", 0)]
 
 
 def _vectors(part: Mapping[str, Any], frame: str) -> Iterable[float]:

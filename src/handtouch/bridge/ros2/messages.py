@@ -216,6 +216,7 @@ class RosContactPart(IdlStruct, typename="handtouch_msgs::msg::dds_::ContactPart
     base_position_m: Point
     base_normal: Vector3
     base_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
+    id: uint32
 
 
 @dataclass

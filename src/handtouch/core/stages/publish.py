@@ -33,10 +33,10 @@ _PARTS_COUNT = PARTS_COUNT
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9
 
-FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "text", "parts"
+FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "whole", "text", "parts"
 """How a field is written: four kinds from one of INTEGERS; from the memory of the state; as that, plus the
-covariance of the mount; as a text of the pad; as the two contacts of a pad."""
-_INTEGER, _SECONDS, _NAME, _TRUTH, _NUMBERS, _SUM, _TEXT, _PARTS = range(len(FIELD_KINDS))
+covariance of the mount; as a whole number of it; as a text of the pad; as the two contacts of a pad."""
+_INTEGER, _SECONDS, _NAME, _TRUTH, _NUMBERS, _SUM, _WHOLE, _TEXT, _PARTS = range(len(FIELD_KINDS))
 CONDITIONS = (
     "always", "located", "std", "frames", "palm", "base", "modelled", "vector", "part_palm", "part_base",
 )  # fmt: skip
@@ -249,7 +249,7 @@ def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> No
     """Write a field of the layout with its key, unless it is absent; `number` counts its places."""
     at = row * _ROW_COUNT
     kind, is_optional = encoder.layout[at], encoder.layout[at + 2]
-    if kind in (_NUMBERS, _SUM):
+    if kind in (_NUMBERS, _SUM, _WHOLE):
         _write_numbers(encoder, row, pad, number)
     elif kind == _TEXT:
         _write_pad_text(encoder, pad * encoder.pad_text_count + encoder.layout[at + 5])
@@ -291,6 +291,9 @@ def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> 
     _write_key(encoder, row)
     if not is_known:
         _write_byte(encoder, 0xC0)
+        return
+    if encoder.layout[at] == _WHOLE:
+        _write_integer(encoder, int(encoder.state[first]))
         return
     if count:
         _write_byte(encoder, 0x90 + count)

@@ -6,7 +6,7 @@ cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESI
 cdef Py_ssize_t _COVARIANCE, _MOUNT, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _IS_BOUND, _COUNT, _UNKNOWNS
 cdef Py_ssize_t _MOUNT_COUNT
 cdef double _MIN_PEAK, _UNIFORM_VARIANCE
-cdef Py_ssize_t _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD
+cdef Py_ssize_t _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD, _PART_ID, _PART_PLACE, _PART_NEWEST
 cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT
 cdef double _TWO_PI, _INFINITY
 cdef double _PART_MOTION, _MOTION_ALONG, _MOTION_ACROSS
@@ -25,6 +25,7 @@ cdef class ContactSolver:
     cdef Py_ssize_t electrodes
     cdef double[::1] by_x, by_y, by_total
     cdef double moved_x, moved_y
+    cdef bint were_two
     cdef double[::1] currents, weight, gain_covariance, offset_std, values
     cdef unsigned char[::1] force_requested, saturated, crowding
     cdef double[::1] peak_currents, mounts, ampere_per_count, noise_squared
@@ -43,12 +44,22 @@ cdef void _estimate_saturated(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(i=Py_ssize_t, first=Py_ssize_t, fit=locate.Fit, values='double[::1]', row=Py_ssize_t,
                total=double, variance=double, relative=double)
 cdef void _bound_force(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(k=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit, table=locate.ModelTable,
-               at=tables.Placement, parts='double[::1]')
+@cython.locals(row=Py_ssize_t, k=Py_ssize_t, i=Py_ssize_t, parts='double[::1]', were_two=bint)
+cdef bint _forget_parts(ContactSolver solver, Py_ssize_t pad, bint is_new) noexcept
+@cython.locals(row=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t, begin=Py_ssize_t, pair=pairs.PairFit,
+               table=locate.ModelTable, parts='double[::1]', x0=double, y0=double, x1=double, y1=double,
+               kept=double, turned=double, near2=double)
+cdef Py_ssize_t _order_parts(ContactSolver solver, Py_ssize_t pad) noexcept
+cdef double _squared_distance(double[::1] parts, Py_ssize_t at, double x, double y) noexcept
+@cython.locals(newest=double)
+cdef void _name_part(
+    double[::1] parts, Py_ssize_t row, Py_ssize_t at, double x, double y, double near2) noexcept
+@cython.locals(k=Py_ssize_t, row=Py_ssize_t, begin=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit,
+               table=locate.ModelTable, at=tables.Placement, parts='double[::1]')
 cdef void _resolve_pair(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(other=Py_ssize_t, row=Py_ssize_t, n=Py_ssize_t, step=Py_ssize_t, fit=locate.Fit,
+@cython.locals(other=Py_ssize_t, n=Py_ssize_t, step=Py_ssize_t, fit=locate.Fit,
                pair=pairs.PairFit, law=force.PadLaw, table=locate.ModelTable)
-cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t k) noexcept
+cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t k, Py_ssize_t row) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept

@@ -39,11 +39,21 @@ _PAD_NOISE, _CELLS = VALUE_SLICES["pad_noise_m2"].start, VALUE_SLICES["cells"].s
 _MISFIT, _IS_BOUND = VALUE_SLICES["squared_misfit"].start, VALUE_SLICES["is_bound"].start
 _COUNT = max(at.stop for at in VALUE_SLICES.values())
 VALUE_COUNT = _COUNT
-PART_SLICES = slices_of(position_m=3, normal=3, covariance_m2=9, force_n=1, force_std_n=1)
+PART_SLICES = slices_of(
+    position_m=3,
+    normal=3,
+    covariance_m2=9,
+    force_n=1,
+    force_std_n=1,
+    id=1,  # this and the following stay while there is one contact
+    place=2,  # on the pad's rectangle
+    newest_id=1,  # of the pad, in the first of two
+)
 """Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
 _PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
 _PART_COVARIANCE, _PART_FORCE = PART_SLICES["covariance_m2"].start, PART_SLICES["force_n"].start
-_PART_FORCE_STD = PART_SLICES["force_std_n"].start
+_PART_FORCE_STD, _PART_ID = PART_SLICES["force_std_n"].start, PART_SLICES["id"].start
+_PART_PLACE, _PART_NEWEST = PART_SLICES["place"].start, PART_SLICES["newest_id"].start
 _PART_COUNT = max(at.stop for at in PART_SLICES.values())
 _PARTS_COUNT = 2 * _PART_COUNT
 PART_COUNT, PARTS_COUNT = _PART_COUNT, _PARTS_COUNT
@@ -123,6 +133,7 @@ class ContactSolver:
         self.ampere_per_count, self.noise_squared = ampere_per_count, noise_squared
         self.mounts, self.crowding = mounts, crowding
         self.saturated, self.peak_currents = saturated, peak_currents
+        self.were_two = False
         self.pair, self.pair_limits, self.moment_stds, self.parts = pair, pair_limits, moment_stds, parts
         self.models, self.pad_tolerances = models, pad_tolerances
         self.laws, self.surfaces = laws, surfaces
@@ -176,8 +187,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     for i in range(_COUNT):
         values[row + i] = _NAN
     values[row + _IS_BOUND] = 1.0 if n - saturated < _UNKNOWNS else 0.0
-    for i in range(_PARTS_COUNT):
-        solver.parts[pad * _PARTS_COUNT + i] = _NAN
+    solver.were_two = _forget_parts(solver, pad, last_x != last_x)
     if not fit.found:
         return
     values[row + _CELLS], values[row + _CELLS + 1] = fit.s, fit.t
@@ -242,6 +252,57 @@ def _bound_force(solver: ContactSolver, pad: int) -> None:
         values[row + _FORCE_STATUS] = _BOUNDED
 
 
+def _forget_parts(solver: ContactSolver, pad: int, is_new: bool) -> bool:
+    """Write NaN for the two contacts of a pad; return True if there were two in its last sample. Their places
+    stay, unless the contact is new."""
+    parts, row = solver.parts, pad * _PARTS_COUNT
+    were_two = parts[row] == parts[row]
+    for k in range(2):
+        for i in range(_PART_ID):
+            parts[row + k * _PART_COUNT + i] = _NAN
+        if is_new:
+            parts[row + k * _PART_COUNT + _PART_PLACE] = _NAN
+    return were_two and not is_new
+
+
+def _order_parts(solver: ContactSolver, pad: int) -> int:
+    """Return which of two contacts found is the first: each is the one that was nearest to it.
+
+    It keeps that one's id. After samples with one contact it must also be nearer than half of the distance
+    between the two; else it is another object's.
+    """
+    pair, table, parts, row = solver.pair, solver.models[pad], solver.parts, pad * _PARTS_COUNT
+    x0 = locate.coordinate(table.nodes_x, table.cells, pair.place[0])
+    y0 = locate.coordinate(table.nodes_y, table.cells, pair.place[1])
+    x1 = locate.coordinate(table.nodes_x, table.cells, pair.place[2])
+    y1 = locate.coordinate(table.nodes_y, table.cells, pair.place[3])
+    first, second = row + _PART_PLACE, row + _PART_COUNT + _PART_PLACE
+    kept = _squared_distance(parts, first, x0, y0) + _squared_distance(parts, second, x1, y1)
+    turned = _squared_distance(parts, first, x1, y1) + _squared_distance(parts, second, x0, y0)
+    begin = 1 if turned < kept else 0
+    if begin:
+        x0, y0, x1, y1 = x1, y1, x0, y0
+    near2 = 0.25 * ((x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0))
+    near2 = _INFINITY if solver.were_two else near2
+    _name_part(parts, row, first, x0, y0, near2)
+    _name_part(parts, row, second, x1, y1, near2)
+    return begin
+
+
+def _squared_distance(parts: memoryview[float], at: int, x: float, y: float) -> float:
+    """Return the squared distance of (x, y) from a place in the parts; NaN if that is none."""
+    return (x - parts[at]) * (x - parts[at]) + (y - parts[at + 1]) * (y - parts[at + 1])
+
+
+def _name_part(parts: memoryview[float], row: int, at: int, x: float, y: float, near2: float) -> None:
+    """Write place and id of one of two contacts; another id unless it is near its last place."""
+    if not _squared_distance(parts, at, x, y) < near2:
+        newest = parts[row + _PART_NEWEST]
+        newest = newest + 1.0 if newest == newest else 1.0
+        parts[row + _PART_NEWEST] = parts[at + _PART_ID - _PART_PLACE] = newest
+    parts[at], parts[at + 1] = x, y
+
+
 def _resolve_pair(solver: ContactSolver, pad: int) -> None:
     """Write the two contacts of a pad, where the currents support two rather than one."""
     fit, pair, table, parts = solver.fit, solver.pair, solver.models[pad], solver.parts
@@ -259,8 +320,9 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
     )
     if not pair.found:
         return
+    begin = _order_parts(solver, pad)
     for k in range(2):
-        row = pad * _PARTS_COUNT + k * _PART_COUNT
+        row = pad * _PARTS_COUNT + (k ^ begin) * _PART_COUNT
         fit.s, fit.t = pair.place[2 * k], pair.place[2 * k + 1]
         fit.x = locate.coordinate(table.nodes_x, table.cells, fit.s)
         fit.y = locate.coordinate(table.nodes_y, table.cells, fit.t)
@@ -271,7 +333,7 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
         tables.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
         at = solver.placement
         if solver.force_requested[pad]:
-            _estimate_part_force(solver, pad, k)
+            _estimate_part_force(solver, pad, k, row)
         parts[row + _PART_POSITION], parts[row + _PART_NORMAL] = at.px, at.nx
         parts[row + _PART_POSITION + 1], parts[row + _PART_NORMAL + 1] = at.py, at.ny
         parts[row + _PART_POSITION + 2], parts[row + _PART_NORMAL + 2] = at.pz, at.nz
@@ -283,15 +345,15 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
         _write_row(parts, row + _PART_COVARIANCE + 6, fit, at, at.tz, at.wz)
 
 
-def _estimate_part_force(solver: ContactSolver, pad: int, k: int) -> None:
-    """Write the force of contact k of a pair; NaN where it has only a lower bound.
+def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> None:
+    """Write the force of contact k of a pair into a row of the parts; NaN where it has only a lower bound.
 
     The other contact's current raises the sheet's potential at this one, by Green's function of a grounded
     boundary, ln(1 + R R' / d^2) / 2 with both spreading radii and the distance, exact in a disc; between bare
     stretches it is more: half of what it changes the force by is added to the standard deviation.
     """
     fit, pair, law, table = solver.fit, solver.pair, solver.laws[pad], solver.models[pad]
-    other, row = 1 - k, pad * _PARTS_COUNT + k * _PART_COUNT
+    other = 1 - k
     total, n = pair.total[k], fit.whitening.electrodes
     dx = fit.x - locate.coordinate(table.nodes_x, table.cells, pair.place[2 * other])
     dy = fit.y - locate.coordinate(table.nodes_y, table.cells, pair.place[2 * other + 1])
