@@ -30,12 +30,16 @@ from handtouch.client.link_columns import FrameName, HandArrays, LinkColumn, Lin
 from handtouch.client.listener import Listener
 from handtouch.client.names import UnknownNameError, unknown_name
 from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect, request
+from handtouch.client.window import HandWindow
 from handtouch.client.wrench import Wrench
 from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 
 QUEUE_MESSAGES = 10_000
 """Messages that wait in this process: those of 4 s with 10 contacts at 200 Hz. Further ones are lost."""
+MAX_WINDOW_S = 60.0
+"""Longest window: 12,000 frames at 200 Hz, of some 2 kB for 15 pads"""
+_WINDOW_MARGIN_NS = 1_000_000_000  # of receptions: frames that waited in queues are older
 _POLL_S = 0.02
 """Longest time until an iterator notices that the daemon is gone"""
 _CLOCK_PERIOD_S = 5.0
@@ -56,6 +60,7 @@ class Hand(LinkColumns, AsyncClosing):
     frame is older than `max_age_s`. A frame's age is by its own time, not by when it was received.
 
     `name`: the hand's in the deployment. `endpoint`, `control` and `key` as for `connect` and `request`.
+    `window_s`: how far back `window` reaches; 0: frames that `latest` skips aren't kept.
     `max_age_s`: None: three of the periods of its frames as `service` states them, or MIN_AGE_LIMIT_S if that
     is longer. Frames of a replay, whose `service` says so, have the age since their reception.
     Raises ValueError for an invalid name or endpoint and for an unusable key file; receiving raises
@@ -72,7 +77,10 @@ class Hand(LinkColumns, AsyncClosing):
         control: str = CONTROL_ENDPOINT,
         key: Path | str | None = None,
         max_age_s: float | None = None,
+        window_s: float = 0.0,
     ) -> None:
+        if not 0 <= window_s <= MAX_WINDOW_S:
+            raise ValueError(f"window_s is {window_s}; it must be from 0 to {MAX_WINDOW_S:g}")
         if max_age_s is not None and not max_age_s > 0:
             raise ValueError(f"max_age_s is {max_age_s}; it must be positive")
         if not name or set(name) & set("/*?["):
@@ -92,6 +100,9 @@ class Hand(LinkColumns, AsyncClosing):
         self._unknown = ""
         self._state = HandState()
         self._arrays: HandArrays | None = None
+        self._window_ns = round(1e9 * window_s)
+        self._kept = deque[tuple[int, list[bytes]]]()  # frames with their reception, for `window`
+        self._window_frames = deque[wire.HandFrame]()
         self._undecoded: dict[bytes, tuple[int, list[bytes]]] = {}  # newest of each contact topic
         self._received = 0
         self._last_receive_ns = self._frame_ns = 0  # receptions
@@ -134,6 +145,36 @@ class Hand(LinkColumns, AsyncClosing):
             if not self._connection.poll(left_ms) and left_ms is not None:
                 return None
         return arrays
+
+    def window(self, seconds: float | None = None) -> HandWindow:
+        """Return the frames of the last seconds, as arrays (n, pads); by default all that are kept.
+
+        For loops that are slower than touch: between two calls no frame is left out, whichever `latest`
+        returned. Raises LookupError while there is no frame, or it is too old, and ValueError for more
+        seconds than `window_s`.
+        """
+        seconds = 1e-9 * self._window_ns if seconds is None else seconds
+        if not 0 < seconds <= 1e-9 * self._window_ns:
+            raise ValueError(
+                f"a window of {seconds:g} s, and {1e-9 * self._window_ns:g} s are kept: "
+                f"make it Hand({self.name!r}, window_s={max(seconds, 0.1):g})"
+            )
+        if self.latest() is None:
+            self._arrays = None
+        newest = self._require_arrays().frame
+        while self._kept:
+            frame = self._decode(self._kept.popleft()[1])
+            if isinstance(frame, wire.HandFrame):
+                self._window_frames.append(frame)
+        since_ns = newest.t_ns - round(1e9 * seconds)
+        frames = {
+            frame.seq: frame
+            for frame in self._window_frames
+            if frame.session == newest.session and frame.links == newest.links and frame.t_ns > since_ns
+        }
+        while self._window_frames and self._window_frames[0].t_ns < newest.t_ns - self._window_ns:
+            self._window_frames.popleft()
+        return HandWindow([frames[seq] for seq in sorted(frames)])
 
     async def wait_async(self, timeout_s: float | None = None) -> HandArrays | None:
         """Do as `wait`, for asyncio: several tasks may wait, and each gets the frame."""
@@ -383,6 +424,8 @@ class Hand(LinkColumns, AsyncClosing):
                 parts = receive(zmq.NOBLOCK)
                 self._received += 1
                 newest[parts[0]] = self._received, parts
+                if self._window_ns and parts[0] == self._frame_topic:
+                    self._keep(parts)
         except zmq.Again:
             pass
         if newest:
@@ -397,10 +440,22 @@ class Hand(LinkColumns, AsyncClosing):
                 self._feed(order, parts)
         self._connection.wake_waiting()
 
-    def _feed(self, order: int, parts: list[bytes]) -> None:
+    def _keep(self, parts: list[bytes]) -> None:
+        """Keep a frame for `window`, and none that is older than it reaches."""
+        now_ns = time.monotonic_ns()
+        self._kept.append((now_ns, parts))
+        while now_ns - self._kept[0][0] > self._window_ns + _WINDOW_MARGIN_NS:
+            self._kept.popleft()
+
+    def _decode(self, parts: list[bytes]) -> wire.Message | None:
         try:
-            message = wire.decode(parts)
+            return wire.decode(parts)
         except wire.WireError:
+            return None
+
+    def _feed(self, order: int, parts: list[bytes]) -> None:
+        message = self._decode(parts)
+        if message is None:
             self.malformed_messages += 1
             return
         before, session = self._state.arrays, self._state.session

@@ -33,7 +33,8 @@ FloatArray = NDArray[np.float64]
 _COLUMNS = wire.COLUMNS[wire.HandFrame]
 _OF_PADS = ("state", "sampled", "sample_ns", "total_current_a", "joints_age_s")
 """Columns that also pads without a contact have a value in"""
-_SAMPLED = (wire.PadState.CLEAR, wire.PadState.TOUCHED)
+SAMPLED_STATES = (wire.PadState.CLEAR, wire.PadState.TOUCHED)
+"""States of pads of which it is known whether they are touched"""
 
 
 class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):
@@ -409,7 +410,7 @@ class HandArrays(LinkColumns):
     def _make_column(self, name: str) -> LinkColumn[Any]:
         if name == "touched":
             state = self.state.array
-            is_unknown = ~np.isin(state, _SAMPLED)
+            is_unknown = ~np.isin(state, SAMPLED_STATES)
             touched = np.ma.MaskedArray(state == wire.PadState.TOUCHED, mask=is_unknown)
             return TouchedColumn(touched, self._rows, self._why_unknown)
         codes = _COLUMNS[name].codes if name in _COLUMNS else None
@@ -441,7 +442,7 @@ class HandArrays(LinkColumns):
 
     def _make_array(self, name: str) -> NDArray[Any]:
         if name == "sampled":
-            return np.isin(self.state.array, _SAMPLED)
+            return np.isin(self.state.array, SAMPLED_STATES)
         data = getattr(self.frame, name)
         if not data and self.links and name.startswith("force_vector"):
             raise LookupError(f"{name} needs a pad with a shear pad; see docs/shear.md")

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config import shipped
-from handtouch.simulate.tactile.sensor import TactileReading, TactileSensor
-from handtouch.wire import PadState
+from handtouch.learn import TouchFeatures
+from handtouch.simulate.tactile.sensor import TactileSensor
 
 FloatArray = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
@@ -39,7 +39,6 @@ MASS_KG, FRICTION = (0.03, 0.15), (0.3, 1.0)
 """Limits of the objects, log-uniform."""
 _LIFT_S = (0.2, 0.7)
 """The object's weight is transferred from its support to the grip in this time."""
-_PADS = ("thumb_tip", "index_tip")
 _SCENE = """
 <mujoco>
   <option timestep="0.002" cone="elliptic" impratio="20"/>
@@ -63,16 +62,10 @@ _SCENE = """
 </mujoco>
 """  # the thumb's plate faces +x, the index finger's tip closes along -x, gravity acts along -z
 
-_TOUCH = (
-    "touched", "x_m", "y_m", "force_n", "force_std_n", "sampled", "position_known", "force_known",
-)  # fmt: skip
+TOUCH = TouchFeatures(("thumb_tip", "index_tip"))
 FEATURES: Mapping[str, Mapping[str, Any]] = {
     "observation.state": {"dtype": "float32", "shape": (2,), "names": ["grip_force_n", "finger_m"]},
-    "observation.touch": {
-        "dtype": "float32",
-        "shape": (len(_PADS) * len(_TOUCH),),
-        "names": [f"{pad}.{name}" for pad in _PADS for name in _TOUCH],
-    },
+    "observation.touch": TOUCH.declaration(),
     "action": {"dtype": "float32", "shape": (1,), "names": ["grip_force_rate"]},
 }
 """Observations and action as LeRobot declares the features of a dataset; its `fps` is 1 / PERIOD_S."""
@@ -94,7 +87,7 @@ class _Grips:
         self._body = model.body("object").id
         self._inertia_m2 = model.body_inertia[self._body] / model.body_mass[self._body]
         self._geoms = [model.geom(name).id for name in ("bead", "back")]
-        self.touch = np.zeros((count, len(_PADS) * len(_TOUCH)), np.float32)
+        self.touch = np.zeros((count, TOUCH.size), np.float32)
 
     def reset(self, number: int, mass_kg: float, friction: float) -> None:
         """Put a new object into a grip, supported."""
@@ -109,7 +102,7 @@ class _Grips:
 
     def read(self) -> None:
         """Sense all grips."""
-        self.touch = _touch(self.sensor.read(self.states))
+        self.touch = TOUCH.of(self.sensor.read(self.states), links=self.sensor.links)
 
     def step(self, actions: FloatArray) -> FloatArray:
         """Apply actions (count,) for a period; return the rewards (count,)."""
@@ -149,25 +142,9 @@ class _Grips:
         mujoco.mj_step(self.models[number], data, self.sensor.steps)
 
 
-def _touch(reading: TactileReading) -> NDArray[np.float32]:
-    """Return the values of `_TOUCH` of each pad (count, pads x 8); what isn't known is 0 and said to be."""
-    x_m, y_m = reading.position_m[..., 0], reading.position_m[..., 1]
-    force_n, std_n = reading.force_n, reading.force_std_n
-    clear, touched = reading.state == PadState.CLEAR, reading.state == PadState.TOUCHED
-    force_known = clear | touched & np.isfinite(force_n) & np.isfinite(std_n)
-    flags = [clear | touched, touched & np.isfinite(x_m), force_known]
-    columns = np.stack([touched, x_m, y_m, force_n, std_n, *flags], axis=-1, dtype=np.float32)
-    return np.nan_to_num(columns).reshape(len(x_m), -1)
-
-
 def _observation_space() -> gymnasium.Space[Any]:
-    return Dict(
-        {
-            name: Box(-np.inf, np.inf, feature["shape"], np.float32)
-            for name, feature in FEATURES.items()
-            if name.startswith("observation.")
-        }
-    )
+    state = Box(-np.inf, np.inf, FEATURES["observation.state"]["shape"], np.float32)
+    return Dict({"observation.state": state, "observation.touch": Box(TOUCH.low, TOUCH.high)})
 
 
 class GripEnvironments(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
