@@ -92,6 +92,7 @@ fastest: $(VENV)/.dev $(VENV)/.core
 lint: $(VENV)/.dev ## check style
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/python -m docs.wire_files --check
 
 types: $(VENV)/.dev ## check static types
 	$(BIN)/mypy --strict
@@ -99,8 +100,8 @@ types: $(VENV)/.dev ## check static types
 docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-tables: $(VENV)/.dev ## write docs/configuration.md, docs/wire.schema.json and the tables of wire.md and firmware.md from the code
-	$(BIN)/python docs/wire_tables.py
+tables: $(VENV)/.dev ## write from the code what is generated of messages (docs/wire_files.py lists it), configuration.md and firmware.md
+	$(BIN)/python -m docs.wire_files
 	$(BIN)/python docs/firmware_tables.py
 	@mkdir -p build
 	$(BIN)/python docs/configuration_page.py >build/configuration.md && mv build/configuration.md docs/configuration.md

@@ -34,7 +34,7 @@ from handtouch.bridge.ros2.network import RosNetwork
 from handtouch.bridge.ros2.relay import TOPICS, RosRelay, relay_received
 from handtouch.client import Subscriber
 from handtouch.client.hand import Hand
-from handtouch.client.link_columns import HandArrays
+from handtouch.client.hand_arrays import HandArrays
 from handtouch.config import Deployment, load
 from handtouch.host.signals import stop_on_signals
 from handtouch.simulate.scenario import Scenario

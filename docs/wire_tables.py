@@ -1,6 +1,6 @@
-"""Tables of docs/wire.md and the file docs/wire.schema.json, from the declarations of the payloads.
+"""Tables of docs/wire.md and the text of docs/wire.schema.json, from the declarations of the payloads.
 
-`make tables` writes both. Public name: `with_tables`.
+Public names: `with_tables`, `schema_text`.
 
 The page marks each table by a comment: `<!-- table: NAME -->` with `topics`, `internal topics`,
 `status codes` or the name of a class; `required` or `optional` after it selects the keys that are always
@@ -15,7 +15,6 @@ import typing
 from collections.abc import Iterator, Sequence
 from enum import Enum
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any
 
 from handtouch.wire.columns import is_array
@@ -46,6 +45,11 @@ def with_tables(page: str) -> str:
     return _TABLE.sub(
         lambda mark: f"{mark[1]}{f' {mark[2]}' if mark[2] else ''}{mark[3]}{_table(mark[1], mark[2])}", page
     )
+
+
+def schema_text() -> str:
+    """Return the text of docs/wire.schema.json."""
+    return json.dumps(json_schema(), indent=1, ensure_ascii=False) + "\n"
 
 
 def _table(name: str, selection: str | None) -> str:
@@ -147,15 +151,3 @@ def _classes_in(hint: Any) -> Iterator[type[Any]]:
 
 
 _FIELDS = _fields_by_class()
-
-
-def main() -> None:
-    """Write both files."""
-    folder = Path(__file__).parent
-    page = folder / "wire.md"
-    page.write_text(with_tables(page.read_text()))
-    (folder / "wire.schema.json").write_text(json.dumps(json_schema(), indent=1, ensure_ascii=False) + "\n")
-
-
-if __name__ == "__main__":
-    main()

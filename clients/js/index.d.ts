@@ -1,13 +1,8 @@
-export const SCHEMA_VERSION: 1;
-export const PAD_STATES: readonly PadState[];
-export const POSITION_STATUSES: readonly PositionStatus[];
-export const FORCE_STATUSES: readonly ForceStatus[];
-export const FRAME_STATUSES: readonly FrameStatus[];
+import type { Columns, Contact, Envelope, Scalars, Vectors } from "./fields.js";
 
-export type PadState = "clear" | "touched" | "stale" | "lost" | "faulted" | "starting" | "off";
-export type PositionStatus = "not_computed" | "valid" | "unreliable" | "invalid";
-export type ForceStatus = "not_computed" | "valid" | "lower_bound" | "unreliable" | "invalid";
-export type FrameStatus = "not_computed" | "valid" | "stale" | "invalid";
+export * from "./fields.js";
+
+export const SCHEMA_VERSION: 1;
 
 /** A message that violates the wire contract. */
 export class WireError extends Error {}
@@ -21,127 +16,8 @@ export class UnknownNameError extends Error {}
 /** A loop over the frames of a daemon that is gone, or was restarted. */
 export class DisconnectedError extends Error {}
 
-interface Envelope {
-  v: 1;
-  session: number | bigint;
-  seq: number;
-  t_ns: bigint;
-  retained: boolean;
-}
-
-/** `contact/<hand>/<link>`: begin, update or end of one contact; fields as in docs/wire.md. */
-export interface Contact extends Envelope {
-  event: "begin" | "update" | "end";
-  id: number;
-  hand: string;
-  link: string;
-  frame: string;
-  begin_ns: bigint;
-  duration_s: number;
-  age_s: number;
-  position_m: number[] | null;
-  normal: number[] | null;
-  covariance_m2: number[] | null;
-  pad_m: number[] | null;
-  position_status: PositionStatus;
-  force_n: number | null;
-  force_std_n: number | null;
-  peak_force_n: number | null;
-  force_status: ForceStatus;
-  total_current_a: number;
-  residual: number | null;
-  residual_std: number | null;
-  begin_threshold_n: number;
-  end_threshold_n: number;
-  calibration_id: string;
-  end_reason: "released" | "stale" | "lost" | "faulted" | "off" | "restarted" | "stopped" | "";
-  group?: number;
-  palm_status?: FrameStatus;
-  palm_position_m?: number[] | null;
-  palm_normal?: number[] | null;
-  palm_covariance_m2?: number[] | null;
-  base_status?: FrameStatus;
-  base_position_m?: number[] | null;
-  base_normal?: number[] | null;
-  base_covariance_m2?: number[] | null;
-  joints_age_s?: number | null;
-  uncompensated_force_n?: number | null;
-  diagnoses?: string[];
-  /** two contacts at once on a pad of six or more electrodes; absent for one */
-  parts?: {
-    position_m: number[];
-    normal: number[];
-    covariance_m2: number[];
-    force_n: number | null;
-    force_std_n: number | null;
-    /** absent unless the contact's own status in that frame is valid */
-    palm_position_m?: number[];
-    palm_normal?: number[];
-    palm_covariance_m2?: number[];
-    base_position_m?: number[];
-    base_normal?: number[];
-    base_covariance_m2?: number[];
-    /** the same while it is followed by nearness */
-    id?: number;
-  }[];
-  /** false while samples are missing: values of the last sample; absent where true */
-  fresh?: boolean;
-  force_vector_status?: ForceStatus;
-  /** force on the pad above a shear pad, in the link's frame, and its covariance row by row */
-  force_vector_n?: number[];
-  force_vector_covariance_n2?: number[];
-  /** part of covariance_m2 by the pad's mount on its link */
-  mount_covariance_m2?: number[];
-  palm_force_vector_n?: number[];
-  base_force_vector_n?: number[];
-}
-
-interface RequiredColumns {
-  state: Uint8Array;
-  contact_id: Uint32Array;
-  sample_ns: BigInt64Array;
-  total_current_a: Float32Array;
-  position_m: Float32Array;
-  normal: Float32Array;
-  covariance_m2: Float32Array;
-  pad_m: Float32Array;
-  position_status: Uint8Array;
-  force_n: Float32Array;
-  force_std_n: Float32Array;
-  force_status: Uint8Array;
-  residual: Float32Array;
-  residual_std: Float32Array;
-}
-
-interface OptionalColumns {
-  group?: Uint32Array;
-  palm_status?: Uint8Array;
-  palm_position_m?: Float32Array;
-  palm_normal?: Float32Array;
-  palm_covariance_m2?: Float32Array;
-  base_status?: Uint8Array;
-  base_position_m?: Float32Array;
-  base_normal?: Float32Array;
-  base_covariance_m2?: Float32Array;
-  joints_age_s?: Float32Array;
-  force_vector_status?: Uint8Array;
-  force_vector_n?: Float32Array;
-  force_vector_covariance_n2?: Float32Array;
-  mount_covariance_m2?: Float32Array;
-  palm_force_vector_n?: Float32Array;
-  base_force_vector_n?: Float32Array;
-}
-
-type Scalars = "state" | "contact_id" | "total_current_a" | "position_status" | "force_n" | "force_std_n"
-  | "force_status" | "residual" | "residual_std" | "group" | "palm_status" | "base_status" | "joints_age_s"
-  | "force_vector_status";
-type Vectors = "position_m" | "normal" | "covariance_m2" | "pad_m" | "palm_position_m" | "palm_normal"
-  | "palm_covariance_m2" | "base_position_m" | "base_normal" | "base_covariance_m2"
-  | "force_vector_n" | "force_vector_covariance_n2" | "palm_force_vector_n" | "base_force_vector_n"
-  | "mount_covariance_m2";
-
 /** `hand/<hand>`: the whole hand at one tick; columns have a row for each link, NaN where unknown. */
-export interface Frame extends Envelope, RequiredColumns, OptionalColumns {}
+export interface Frame extends Envelope, Columns {}
 export class Frame {
   tick: number;
   hand: string;

@@ -2,41 +2,11 @@
 
 import { decode } from "@msgpack/msgpack";
 
-export const SCHEMA_VERSION = 1;
-export const PAD_STATES = ["clear", "touched", "stale", "lost", "faulted", "starting", "off"];
-export const POSITION_STATUSES = ["not_computed", "valid", "unreliable", "invalid"];
-export const FORCE_STATUSES = ["not_computed", "valid", "lower_bound", "unreliable", "invalid"];
-export const FRAME_STATUSES = ["not_computed", "valid", "stale", "invalid"];
+import { OPTIONAL_COLUMNS, PAD_STATES, REQUIRED_COLUMNS } from "./fields.js";
 
-const PLACE = { position_m: [Float32Array, 3], normal: [Float32Array, 3], covariance_m2: [Float32Array, 9] };
-const inFrame = (prefix) => Object.entries(PLACE).map(([name, layout]) => [prefix + name, layout]);
-const REQUIRED = {
-  state: [Uint8Array, 1],
-  contact_id: [Uint32Array, 1],
-  sample_ns: [BigInt64Array, 1],
-  total_current_a: [Float32Array, 1],
-  ...PLACE,
-  pad_m: [Float32Array, 2],
-  position_status: [Uint8Array, 1],
-  force_n: [Float32Array, 1],
-  force_std_n: [Float32Array, 1],
-  force_status: [Uint8Array, 1],
-  residual: [Float32Array, 1],
-  residual_std: [Float32Array, 1],
-};
-const OPTIONAL = {
-  group: [Uint32Array, 1],
-  palm_status: [Uint8Array, 1],
-  base_status: [Uint8Array, 1],
-  ...Object.fromEntries([...inFrame("palm_"), ...inFrame("base_")]),
-  joints_age_s: [Float32Array, 1],
-  force_vector_status: [Uint8Array, 1],
-  force_vector_n: [Float32Array, 3],
-  force_vector_covariance_n2: [Float32Array, 9],
-  mount_covariance_m2: [Float32Array, 9],
-  palm_force_vector_n: [Float32Array, 3],
-  base_force_vector_n: [Float32Array, 3],
-};
+export { FORCE_STATUSES, FRAME_STATUSES, PAD_STATES, POSITION_STATUSES } from "./fields.js";
+
+export const SCHEMA_VERSION = 1;
 
 /** A message that violates the wire contract. */
 export class WireError extends Error {}
@@ -92,8 +62,8 @@ export class Frame {
 
   constructor(map) {
     if (!Array.isArray(map.links)) throw new WireError("links is missing");
-    for (const [name, layout] of Object.entries(REQUIRED)) map[name] = column(map, name, layout);
-    for (const [name, layout] of Object.entries(OPTIONAL)) {
+    for (const [name, layout] of Object.entries(REQUIRED_COLUMNS)) map[name] = column(map, name, layout);
+    for (const [name, layout] of Object.entries(OPTIONAL_COLUMNS)) {
       if (name in map) map[name] = column(map, name, layout);
     }
     Object.assign(this, map);

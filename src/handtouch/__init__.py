@@ -15,14 +15,14 @@ if TYPE_CHECKING:
     from handtouch.client import Subscriber, UnknownNameError, columns, connect, request
     from handtouch.client.control import DaemonControl
     from handtouch.client.hand import Hand
-    from handtouch.client.link_columns import NotSampledError
+    from handtouch.client.link_column import NotSampledError
     from handtouch.client.robot import Robot
 
 __version__ = "0.1.0"
 _MODULES = {
     "DaemonControl": "handtouch.client.control",
     "Hand": "handtouch.client.hand",
-    "NotSampledError": "handtouch.client.link_columns",
+    "NotSampledError": "handtouch.client.link_column",
     "Robot": "handtouch.client.robot",
     "Subscriber": "handtouch.client",
     "UnknownNameError": "handtouch.client",

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 import handtouch
 from handtouch import wire
 from handtouch.client.daemon_clock import MIN_AGE_LIMIT_S, DaemonClock, age_limit_s
-from handtouch.client.link_columns import HandArrays, NotSampledError
+from handtouch.client.hand_arrays import HandArrays
+from handtouch.client.link_column import NotSampledError
 from tests.client.hand_messages import LINKS, make_frame, make_service
 
 LONGEST_S = 60.0

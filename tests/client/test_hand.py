@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 import handtouch
 from handtouch import wire
+from handtouch.client.hand_arrays import HandArrays
 from handtouch.client.hand_state import HandState
-from handtouch.client.link_columns import HandArrays
 from handtouch.client.wrench import contact_wrenches, grasp_matrix
 from tests.client.hand_messages import LINKS, make_contact, make_frame
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -181,7 +180,7 @@ def test_two_simulated_presses_are_published_with_positions_forces_and_covarianc
         row = np.concatenate([part["position_m"], part["normal"], part["covariance_m2"]])
         assert squared_deviations(row, np.array(truth.position_m)) < 13.8  # 99.9 %
         assert part["force_n"] == pytest.approx(truth.force_n, rel=0.03)
-        assert 0 < part["force_std_n"] < 0.05
+        assert 0 < (part["force_std_n"] or 0.0) < 0.05
     alone = next(contact for contact in sink.contacts if contact.t_ns == PERIOD_NS * 109)
     assert alone.parts == ()
     assert sink.contacts[-1].event == "end"
@@ -266,7 +265,7 @@ def test_the_two_contacts_have_palm_and_base_positions_where_their_contact_has(
     held.base_status[PAD] = wire.FrameStatus.VALID
     contact = published_contact(pipeline)
     assert contact.parts[1]["base_normal"] == [148.0, 149.0, 150.0]
-    assert set(contact.parts[0]) == {field.name for field in fields(wire.ContactPart)}
+    assert set(contact.parts[0]) == set(wire.ContactPart.__annotations__)
 
 
 def published_contact(pipeline: Pipeline) -> wire.Contact:

@@ -37,6 +37,7 @@ void print_list(const Items& items) {
 template <std::size_t N>
 void print(const handtouch::Vector<N>& value) { print_list(value); }
 void print(const std::vector<std::string>& value) { print_list(value); }
+void print(const std::vector<handtouch::ContactPart>& parts);
 template <class T, std::size_t N>
 void print(const handtouch::Column<T, N>& value) { print_list(value.values()); }
 
@@ -47,41 +48,42 @@ void print(const std::optional<T>& value) {
 }
 
 template <class T>
-void field(const std::string& name, const T& value) {
-    std::printf(",\"%s\":", name.c_str());
+void field(const std::string& name, const T& value, const char* separator = ",") {
+    std::printf("%s\"%s\":", separator, name.c_str());
     print(value);
 }
 
-template <class T, std::size_t N>
-void optional_field(const char* name, const handtouch::Column<T, N>& column) {
-    if (!column.empty()) field(name, column);
-}
+struct FieldPrinter {
+    template <class T>
+    void operator()(const char* name, const T& value, bool) const { field(name, value); }
+    template <class T, std::size_t N>
+    void operator()(const char* name, const handtouch::Column<T, N>& column, bool) const {
+        if (!column.empty()) field(name, column);
+    }
+};
 
-void print_place(const std::string& prefix, const std::string& status, const handtouch::Place& place) {
-    field(prefix + "position_m", place.position_m);
-    field(prefix + "normal", place.normal);
-    field(prefix + "covariance_m2", place.covariance_m2);
-    field(status, place.status);
-}
-
-void print_vectors(const std::string& prefix, const handtouch::Place& place) {
-    if (!place.position_m) return;
-    field(prefix + "position_m", place.position_m);
-    field(prefix + "normal", place.normal);
-    field(prefix + "covariance_m2", place.covariance_m2);
-}
-
-void print_parts(const std::vector<handtouch::ContactPart>& parts) {
-    std::fputs(",\"parts\":[", stdout);
+struct PartPrinter {
     const char* separator = "";
+    template <class T>
+    void operator()(const char* name, const T& value, bool) {
+        field(name, value, separator);
+        separator = ",";
+    }
+    template <class T>
+    void operator()(const char* name, const std::optional<T>& value, bool optional) {
+        if (!value && optional) return;
+        field(name, value, separator);
+        separator = ",";
+    }
+};
+
+void print(const std::vector<handtouch::ContactPart>& parts) {
+    const char* separator = "";
+    std::putchar('[');
     for (const handtouch::ContactPart& part : parts) {
-        std::printf("%s{\"force_n\":", separator);
-        print(part.force_n);
-        field("force_std_n", part.force_std_n);
-        print_vectors("", part.in_link);
-        print_vectors("palm_", part.in_palm);
-        print_vectors("base_", part.in_base);
-        field("id", part.id);
+        std::printf("%s{", separator);
+        PartPrinter print_field;
+        handtouch::each_field_of_contact_part(part, print_field);
         std::putchar('}');
         separator = ",";
     }
@@ -90,50 +92,15 @@ void print_parts(const std::vector<handtouch::ContactPart>& parts) {
 
 void print_contact(const handtouch::Contact& c) {
     std::printf("{\"kind\":\"contact\"");
-    field("session", c.session); field("seq", c.seq); field("t_ns", c.t_ns); field("begin_ns", c.begin_ns);
-    field("id", c.id); field("group", c.group); field("event", c.event); field("hand", c.hand);
-    field("link", c.link); field("end_reason", c.end_reason); field("calibration_id", c.calibration_id);
-    field("force_status", c.force_status); field("retained", c.retained); field("duration_s", c.duration_s);
-    field("fresh", c.fresh);
-    field("age_s", c.age_s); field("begin_threshold_n", c.begin_threshold_n);
-    field("end_threshold_n", c.end_threshold_n); field("pad_m", c.pad_m); field("force_n", c.force_n);
-    field("force_std_n", c.force_std_n); field("peak_force_n", c.peak_force_n);
-    field("total_current_a", c.total_current_a); field("uncompensated_force_n", c.uncompensated_force_n);
-    field("residual", c.residual); field("residual_std", c.residual_std);
-    field("joints_age_s", c.joints_age_s); field("diagnoses", c.diagnoses);
-    print_place("", "position_status", c.in_link);
-    field("mount_covariance_m2", c.mount_covariance_m2);
-    print_place("palm_", "palm_status", c.in_palm);
-    print_place("base_", "base_status", c.in_base);
-    field("force_vector_status", c.force_vector_status); field("force_vector_n", c.force_vector_n);
-    field("force_vector_covariance_n2", c.force_vector_covariance_n2);
-    field("palm_force_vector_n", c.palm_force_vector_n); field("base_force_vector_n", c.base_force_vector_n);
-    print_parts(c.parts);
+    handtouch::each_field_of_contact(c, FieldPrinter{});
     std::puts("}");
 }
 
 void print_frame(const handtouch::Frame& f, const std::map<std::string, handtouch::Contact>* contacts) {
     std::printf("{\"kind\":\"hand\"");
     field("session", f.session); field("seq", f.seq); field("t_ns", f.t_ns); field("tick", f.tick);
-    field("retained", f.retained); field("hand", f.hand); field("links", f.links); field("state", f.state);
-    field("contact_id", f.contact_id); field("sample_ns", f.sample_ns);
-    field("total_current_a", f.total_current_a); field("position_m", f.position_m); field("normal", f.normal);
-    field("covariance_m2", f.covariance_m2); field("pad_m", f.pad_m);
-    field("position_status", f.position_status); field("force_n", f.force_n);
-    field("force_std_n", f.force_std_n); field("force_status", f.force_status);
-    field("residual", f.residual); field("residual_std", f.residual_std);
-    optional_field("group", f.group);
-    optional_field("palm_status", f.palm_status); optional_field("palm_position_m", f.palm_position_m);
-    optional_field("palm_normal", f.palm_normal); optional_field("palm_covariance_m2", f.palm_covariance_m2);
-    optional_field("base_status", f.base_status); optional_field("base_position_m", f.base_position_m);
-    optional_field("base_normal", f.base_normal); optional_field("base_covariance_m2", f.base_covariance_m2);
-    optional_field("mount_covariance_m2", f.mount_covariance_m2);
-    optional_field("joints_age_s", f.joints_age_s);
-    optional_field("force_vector_status", f.force_vector_status);
-    optional_field("force_vector_n", f.force_vector_n);
-    optional_field("force_vector_covariance_n2", f.force_vector_covariance_n2);
-    optional_field("palm_force_vector_n", f.palm_force_vector_n);
-    optional_field("base_force_vector_n", f.base_force_vector_n);
+    field("retained", f.retained); field("hand", f.hand); field("links", f.links);
+    handtouch::each_field_of_frame_columns(f, FieldPrinter{});
     if (contacts != nullptr) {
         std::printf(",\"contacts\":{");
         const char* separator = "";

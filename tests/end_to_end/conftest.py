@@ -221,7 +221,7 @@ def javascript(pytestconfig: pytest.Config) -> Path:
     here = Path(__file__).parents[1] / "javascript"
     digest = hashlib.sha256((here / "package-lock.json").read_bytes()).hexdigest()[:12]
     folder = Path(pytestconfig.cache.mkdir(f"javascript-{digest}"))
-    for file in here.iterdir():
+    for file in (*here.iterdir(), ROOT / "docs/wire.schema.json"):
         shutil.copy(file, folder)
     if not (folder / "node_modules/.package-lock.json").exists():  # npm writes it last
         install = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]

@@ -9,6 +9,7 @@ import json
 import subprocess
 import threading
 import time
+import typing
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -113,11 +114,11 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
             return None
         return tuple(real(*shape).tolist()) if shape else float(real())
 
-    def part() -> dict[str, Any]:
+    def part() -> wire.ContactPart:
         sizes = {"position_m": 3, "normal": 3, "covariance_m2": 9}
         frames = [prefix for prefix in ("", "palm_", "base_") if not prefix or rng.random() < 0.5]
         vectors = {f"{frame}{name}": real(size).tolist() for frame in frames for name, size in sizes.items()}
-        return {"force_n": maybe(), "force_std_n": maybe(), **vectors}
+        return typing.cast(wire.ContactPart, {"force_n": maybe(), "force_std_n": maybe(), **vectors})
 
     def pick(codes: Any) -> Any:
         return list(codes)[rng.integers(len(codes))].text

@@ -5,6 +5,8 @@
 // {"alive": false} and {"alive": true} report that the daemon disconnected and connected again. At the end of
 // standard input, {"summary"} is printed with all counters, and the program ends.
 
+import { readFileSync } from "node:fs";
+
 import { decode } from "@msgpack/msgpack";
 import { Subscriber } from "zeromq";
 
@@ -17,50 +19,13 @@ const uint32 = { bytes: 4, read: (view, at) => view.getUint32(at, true) };
 const int64 = { bytes: 8, read: (view, at) => view.getBigInt64(at, true) };
 const float32 = { bytes: 4, read: (view, at) => view.getFloat32(at, true) };
 
-// column -> [type of its elements, elements in a row]
-const COLUMNS = {
-  hand: {
-    state: [uint8, 1],
-    contact_id: [uint32, 1],
-    sample_ns: [int64, 1],
-    total_current_a: [float32, 1],
-    position_m: [float32, 3],
-    normal: [float32, 3],
-    covariance_m2: [float32, 9],
-    pad_m: [float32, 2],
-    position_status: [uint8, 1],
-    force_n: [float32, 1],
-    force_std_n: [float32, 1],
-    force_status: [uint8, 1],
-    residual: [float32, 1],
-    residual_std: [float32, 1],
-  },
-  raw: { counts: [int64, 4], sample_ns: [int64, 1], fresh: [uint8, 1] },
-};
+// as docs/wire.schema.json declares them: topic -> column -> {type, elements}
+const ELEMENTS = { uint8, uint32, int64, float32 };
+const SCHEMA = JSON.parse(readFileSync(new URL("wire.schema.json", import.meta.url)));
+const DEFINITIONS = { hand: SCHEMA.$defs.HandFrame, raw: SCHEMA.$defs.Raw };
 
-// columns that are present only where a scene requests them
-const OPTIONAL = {
-  hand: {
-    group: [uint32, 1],
-    palm_status: [uint8, 1],
-    palm_position_m: [float32, 3],
-    palm_normal: [float32, 3],
-    palm_covariance_m2: [float32, 9],
-    base_status: [uint8, 1],
-    base_position_m: [float32, 3],
-    base_normal: [float32, 3],
-    base_covariance_m2: [float32, 9],
-    mount_covariance_m2: [float32, 9],
-    joints_age_s: [float32, 1],
-    force_vector_status: [uint8, 1],
-    force_vector_n: [float32, 3],
-    force_vector_covariance_n2: [float32, 9],
-    palm_force_vector_n: [float32, 3],
-    base_force_vector_n: [float32, 3],
-  },
-};
-
-function columnOf(bytes, [type, elements], rows) {
+function columnOf(bytes, column, rows) {
+  const [type, elements] = [ELEMENTS[column.type], column.elements];
   if (!(bytes instanceof Uint8Array) || bytes.length !== rows * elements * type.bytes) {
     throw new Error("a column doesn't match its links");
   }
@@ -83,11 +48,11 @@ function read(parts) {
   for (const key of ["session", "seq"]) {
     if (!["number", "bigint"].includes(typeof payload[key])) throw new Error(`no ${key}`);
   }
-  for (const [name, shape] of Object.entries(COLUMNS[kind] ?? {})) {
-    payload[name] = columnOf(payload[name], shape, payload.links.length);
-  }
-  for (const [name, shape] of Object.entries(OPTIONAL[kind] ?? {})) {
-    if (name in payload) payload[name] = columnOf(payload[name], shape, payload.links.length);
+  const { properties, required } = DEFINITIONS[kind] ?? { properties: {}, required: [] };
+  for (const [name, { column }] of Object.entries(properties)) {
+    if (column && (name in payload || required.includes(name))) {
+      payload[name] = columnOf(payload[name], column, payload.links.length);
+    }
   }
   return { topic, payload };
 }

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.client.link_columns import HandArrays
+from handtouch.client.hand_arrays import HandArrays
 from handtouch.client.window import HandWindow
 from handtouch.learn import TouchFeatures
 from handtouch.learn.features import MAX_AGE_S

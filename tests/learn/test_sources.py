@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from handtouch import wire
-from handtouch.client.link_columns import HandArrays
+from handtouch.client.hand_arrays import HandArrays
 from handtouch.client.window import HandWindow
 from handtouch.learn import TouchFeatures
 from handtouch.simulate import TactileReading

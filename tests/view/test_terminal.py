@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -15,6 +16,7 @@ from handtouch.view.message_lines import diagnosis_text, message_line, position_
 from handtouch.view.terminal import HandView
 from handtouch.wire.health import Emergency
 
+PLACE: Any = {"normal": [0.0, 0.0, 1.0], "covariance_m2": [1e-8] * 9}
 CONTACT = wire.Contact(
     v=1,
     session=1,
@@ -161,8 +163,8 @@ def test_a_disconnected_daemon_differs_from_an_untouched_hand() -> None:
             replace(
                 CONTACT,
                 parts=(
-                    {"position_m": [0.001, 0.002, 0.003], "force_n": 1.5, "force_std_n": 0.25},
-                    {"position_m": [-0.01, 0.002, 0.003], "force_n": None, "force_std_n": None},
+                    {"position_m": [0.001, 0.002, 0.003], **PLACE, "force_n": 1.5, "force_std_n": 0.25},
+                    {"position_m": [-0.01, 0.002, 0.003], **PLACE, "force_n": None, "force_std_n": None},
                 ),
             ),
             "2 contacts: (1.00, 2.00, 3.00) mm 1.50 +- 0.25 N and (-10.00, 2.00, 3.00) mm",

@@ -25,8 +25,9 @@ from handtouch import wire
 from handtouch.client.connection import RECONNECT_OPTIONS, Connection
 from handtouch.client.control import DaemonControl, Output, Scenes, TareResult
 from handtouch.client.daemon_clock import DaemonClock, age_limit_s
+from handtouch.client.hand_arrays import FrameName, HandArrays, LinkColumns
 from handtouch.client.hand_state import HandState
-from handtouch.client.link_columns import FrameName, HandArrays, LinkColumn, LinkColumns
+from handtouch.client.link_column import LinkColumn
 from handtouch.client.listener import Listener
 from handtouch.client.names import UnknownNameError, unknown_name
 from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect, request

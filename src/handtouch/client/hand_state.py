@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from handtouch import wire
-from handtouch.client.link_columns import HandArrays
+from handtouch.client.hand_arrays import HandArrays
 
 
 class _OrderedContact(NamedTuple):

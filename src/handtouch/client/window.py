@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.client.link_columns import SAMPLED_STATES, HandArrays
+from handtouch.client.hand_arrays import SAMPLED_STATES, HandArrays
 
 _COLUMNS = wire.COLUMNS[wire.HandFrame]
 

@@ -84,9 +84,11 @@ _PLACES = {
 """Numbers that are known under a condition: that, an array of the state, and their place in its rows. Others
 are those of the same name in VALUE_SLICES, or in the state."""
 _PART_PLACES = {
-    **{name: (f"part_{frame}", "part_frames", at) for name, (frame, at) in _FRAME_FIELDS.items()},
     **{name: ("always", "parts", at) for name, at in PART_SLICES.items()},
+    **{name: (f"part_{frame}", "part_frames", at) for name, (frame, at) in _FRAME_FIELDS.items()},
 }
+"""The same of the fields of `wire.ContactPart`"""
+_PART_FIELDS = tuple(wire.ContactPart.__annotations__)
 _PART_STEPS = {"parts": PART_COUNT, "part_frames": 2 * FRAME_VALUES}
 _MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
@@ -327,7 +329,7 @@ class ContactMessageEncoder:
         pack = self._pack = msgpack.Packer().pack
         contact_fields = [field for field in fields(wire.Contact) if field.name not in ("v", "session")]
         names = [name for field in contact_fields for name in _NAMES.get(field.name, ())]
-        keys = [pack(field.name) for field in (*contact_fields, *fields(wire.ContactPart))]
+        keys = [pack(name) for name in (*(field.name for field in contact_fields), *_PART_FIELDS)]
         keys[0] = pack("v") + pack(wire.SCHEMA_VERSION) + pack("session") + pack(session) + keys[0]
         self._texts = [*keys, *map(pack, names)]
         self._fields = len(contact_fields)
@@ -368,13 +370,14 @@ class ContactMessageEncoder:
         ]
 
     def _build_stage(self) -> None:
-        tick, number = self._tick, np.zeros(1)
+        tick, summed = self._tick, np.zeros(9)
         ends, pad_ends = (np.cumsum([0, *map(len, texts)]) for texts in (self._texts, self._pad_texts))
         longest = max(np.diff(pad_ends[:: len(_PAD_TEXTS)]))
         self._message = np.zeros(ends[-1] + longest + _MAX_VALUE_BYTES, np.uint8).data
         arrays = {
             "layout": view_memory(self._layout),
             "state": view_memory(tick.state.block.view("<f8")),
+            "state_bits": view_memory(tick.state.block.view("<u8")),
             "position_status": view_memory(tick.columns.position_status),
             "force_status": view_memory(tick.columns.force_status),
             "has_sheet_model": view_memory(tick.sheet_force.modelled),
@@ -382,14 +385,15 @@ class ContactMessageEncoder:
             "text_ends": view_memory(ends),
             "pad_texts": _text_memory(self._pad_texts),
             "pad_text_ends": view_memory(pad_ends),
-            "number": view_memory(number),
-            "number_bytes": view_memory(number.view(np.uint8)),
             "message": self._message,
-            "summed": view_memory(np.zeros(9)),
+            "summed": view_memory(summed),
+            "summed_bits": view_memory(summed.view("<u8")),
             "integers": view_memory(np.zeros(len(INTEGERS), np.int64)),
             "conditions": view_memory(np.zeros(len(CONDITIONS), np.uint8)),
         }
-        self._stage = ContactEncoder(self._fields, len(_PAD_TEXTS), tick.state.memory | arrays)
+        self._stage = ContactEncoder(
+            self._fields, len(_PAD_TEXTS), tick.state.number_of("values"), tick.state.memory | arrays
+        )
 
 
 def _contact_layout(
@@ -415,9 +419,9 @@ def _contact_layout(
             at = VALUE_SLICES.get(name)
             plain = "always", name if at is None else "values", slice(0, 1) if at is None else at
             rows.append(_number_row(state, name, is_optional, _PLACES.get(name, plain)))
-    for field in fields(wire.ContactPart):
-        absent = 0 if field.default is MISSING else 2
-        rows.append(_number_row(state, field.name, absent, _PART_PLACES[field.name]))
+    for name in _PART_FIELDS:
+        absent = 2 * (name in wire.ContactPart.__optional_keys__)
+        rows.append(_number_row(state, name, absent, _PART_PLACES[name]))
     return np.array(rows, np.int64)
 
 

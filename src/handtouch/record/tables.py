@@ -28,7 +28,7 @@ _AXES = {
 }
 _CHANNELS = ("x0_counts", "xa_counts", "y0_counts", "yb_counts")
 _PARTS, _MAX_PARTS = "parts", 2
-_PART_COLUMNS = tuple(field.name for field in fields(wire.ContactPart))
+_PART_COLUMNS = tuple(wire.ContactPart.__annotations__)
 _OMITTED_KEYS = ("v", "retained")
 _PAD_STATES = [state.name.lower() for state in wire.PadState]
 _SCALAR_TYPES = (bool, int, float, str, type(None))

@@ -8,7 +8,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from handtouch.simulate.tactile.sensor import TactileReading, TactileSensor
+    from handtouch.simulate.tactile.reading import TactileReading
+    from handtouch.simulate.tactile.sensor import TactileSensor
 
 __all__ = ["TactileReading", "TactileSensor"]
 

@@ -39,8 +39,8 @@ def contact_line(contact: wire.Contact) -> str:
     return "  ".join(parts)
 
 
-def part_text(part: Mapping[str, Any]) -> str:
-    """Format one of two contacts on a pad, a `wire.ContactPart`."""
+def part_text(part: wire.ContactPart) -> str:
+    """Format one of two contacts on a pad."""
     x, y, z = (1e3 * value for value in part["position_m"])
     force = "" if part["force_n"] is None else f" {part['force_n']:.2f} +- {part['force_std_n'] or 0.0:.2f} N"
     return f"({x:.2f}, {y:.2f}, {z:.2f}) mm{force}"

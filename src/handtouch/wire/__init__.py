@@ -27,12 +27,12 @@ from handtouch.wire.contact import (
     ContactEvent,
     ContactPart,
     EndReason,
-    HandFrame,
     Matrix3,
     Percept,
     PerceptKind,
     Vector3,
 )
+from handtouch.wire.hand_frame import HandFrame
 from handtouch.wire.health import (
     AdaptationStatusName,
     Health,

@@ -209,7 +209,7 @@ def _expected(hint: Any) -> str:
         item = _expected(arguments[0]).split(" ", 1)[1]
         plural = "values true or false" if arguments[0] is bool else f"{item.split(' ')[0]}s"
         return f"a list of {'' if arguments[-1] is Ellipsis else f'{len(arguments)} '}{plural}"
-    return _TYPE_NAMES[origin or hint]
+    return _TYPE_NAMES[dict if typing.is_typeddict(hint) else origin or hint]
 
 
 def _describe(value: Any) -> str:
@@ -237,6 +237,8 @@ def _checker(hint: Any) -> Callable[[Any], Any]:
         item = _checker(arguments[0])
         length = None if arguments[-1] is Ellipsis else len(arguments)
         return lambda value: _check_tuple(value, item, length)
+    if typing.is_typeddict(hint):
+        return _checker(dict)
     accepted = {float: (float, int)}.get(hint, (origin or hint,))
     return lambda value: _check_scalar(value, accepted, hint is bool)
 

@@ -1,6 +1,6 @@
 """Columns: fields of a payload that hold one row per pad, as packed little-endian binary.
 
-Public names: `Column`, `columns_of`, `is_array`.
+Public names: `Column`, `HandColumn`, `columns_of`, `is_array`.
 
 A payload declares a column by annotating a `bytes` field: `force_n: Annotated[bytes, Column("<f4")]`.
 """
@@ -60,6 +60,13 @@ class Column:
         if rows is not None:
             return values.reshape(rows, -1)
         return values if self.elements == 1 else values.reshape(-1, self.elements)
+
+
+@dataclass(frozen=True)
+class HandColumn:
+    """Mark of a field of `Contact` that is a column of hand frames, too."""
+
+    meaning: str = "as in `contact`"
 
 
 def is_array(hint: Any) -> bool:

@@ -1,11 +1,12 @@
-"""Payloads about contacts: `Contact`, `HandFrame`, `Percept`."""
+"""Payloads about contacts: `Contact`, `Percept`, and what `HandFrame` has beside the fields of `Contact`.
 
-from __future__ import annotations
+Encoder, hand frames, clients, ROS messages, pages and schema follow from these declarations: `make tables`.
+"""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
-from handtouch.wire.columns import Column
+from handtouch.wire.columns import Column, HandColumn
 from handtouch.wire.declarations import CLOSED
 from handtouch.wire.status import (
     ForceStatus,
@@ -19,6 +20,9 @@ from handtouch.wire.status import (
 
 Vector3 = tuple[float, float, float]
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
+List3 = Annotated[list[float], Vector3]
+List9 = Annotated[list[float], Matrix3]
+"""Lists of so many numbers, in a map inside of a payload"""
 EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
 ContactEvent = Literal["begin", "update", "end"]
 
@@ -31,42 +35,45 @@ EXPERIMENTAL_PERCEPTS = frozenset({"shape", ACTION_REQUEST})
 """Kinds of percepts of which too little is known in the world `default` to rely on them."""
 
 
-@dataclass(frozen=True, slots=True)
-class ContactPart:
-    """One of two contacts on a pad at once."""
+class ContactPart(TypedDict):
+    """One of two contacts on a pad at once, in `parts`."""
 
-    position_m: Vector3
+    position_m: List3
     """contact position in the link's frame"""
-    normal: Vector3
+    normal: List3
     """outward unit normal of the pad at the position"""
-    covariance_m2: Matrix3
+    covariance_m2: List9
     """covariance of `position_m`, row by row; includes that of the mount"""
     force_n: float | None
     """normal force by the contact law, without compensation of the sheet's behaviour; nil if the scene
     requests no forces, or there is only a lower bound"""
     force_std_n: float | None
     """standard deviation of `force_n`"""
-    palm_position_m: Vector3 | None = None
+    palm_position_m: NotRequired[List3]
     """in the palm's frame; this and the two that follow are absent unless the contact's `palm_status` is
     `valid`"""
-    palm_normal: Vector3 | None = None
+    palm_normal: NotRequired[List3]
     """outward unit normal, in the palm's frame"""
-    palm_covariance_m2: Matrix3 | None = None
+    palm_covariance_m2: NotRequired[List9]
     """covariance of `palm_position_m`, row by row; includes the stated uncertainty of mounts and joints"""
-    base_position_m: Vector3 | None = None
+    base_position_m: NotRequired[List3]
     """in the base's frame; absent, with the two that follow, unless `base_status` is `valid`"""
-    base_normal: Vector3 | None = None
+    base_normal: NotRequired[List3]
     """outward unit normal, in the base's frame"""
-    base_covariance_m2: Matrix3 | None = None
+    base_covariance_m2: NotRequired[List9]
     """covariance of `base_position_m`, row by row"""
-    id: int = 0
+    id: NotRequired[int]
     """of this one among all that the pad has had: the same while it is followed by nearness, also through
     samples in which the currents show one contact only. Both keep their order, too"""
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """`contact/<hand>/<link>`: begin, update or end of one contact."""
+    """`contact/<hand>/<link>`: begin, update or end of one contact.
+
+    Numbers are those of the same name in a pad's row of values, or in the state of the core. A new field is
+    the last, and has a default.
+    """
 
     v: int
     session: int
@@ -90,33 +97,41 @@ class Contact:
     """from `begin_ns` to `t_ns`"""
     age_s: float
     """age of the newest sample at publication"""
-    position_m: Vector3 | None
+    position_m: Annotated[
+        Vector3 | None, HandColumn("in the link's frame; this and the following are NaN without contact")
+    ]
     """contact position in the link's frame"""
-    normal: Vector3 | None
+    normal: Annotated[Vector3 | None, HandColumn("outward unit normal of the pad at the position")]
     """outward unit normal of the pad at the position"""
-    covariance_m2: Matrix3 | None
+    covariance_m2: Annotated[
+        Matrix3 | None, HandColumn("covariance of `position_m`, row by row, with that of the mount")
+    ]
     """covariance of `position_m`, row by row; includes the stated uncertainty of the mount, without which it
     is singular along the normal; larger than from noise alone where `residual` indicates that the contact is
     no point, or that gains are wrong"""
-    pad_m: tuple[float, float] | None
+    pad_m: Annotated[
+        tuple[float, float] | None, HandColumn("arc lengths on the pad, from the electrodes x0 and y0")
+    ]
     """arc lengths on the pad, from the electrodes x0 and y0"""
-    position_status: Annotated[PositionStatusName, PositionStatus]
+    position_status: Annotated[PositionStatusName, PositionStatus, HandColumn("status of the position")]
     """status of the position"""
-    force_n: float | None
+    force_n: Annotated[float | None, HandColumn("normal force")]
     """normal force, for a single contact patch of the radius configured in the deployment; a lower bound
     where `force_status` is `lower_bound`"""
-    force_std_n: float | None
+    force_std_n: Annotated[
+        float | None, HandColumn("its standard deviation; NaN where `force_n` is a lower bound")
+    ]
     """standard deviation of `force_n`; nil unless `force_status` is `valid` or `unreliable`"""
     peak_force_n: float | None
     """maximum force since the contact began, or since the pad's calibration changed"""
-    force_status: Annotated[ForceStatusName, ForceStatus]
+    force_status: Annotated[ForceStatusName, ForceStatus, HandColumn("status of the force")]
     """status of the force"""
     total_current_a: float
     """total current of the pad"""
-    residual: float | None
+    residual: Annotated[float | None, HandColumn()]
     """excess of the two x currents over those of a point contact there, as a fraction of the total; positive:
     elongated along x; nil of pads with other electrodes than x0, xa, y0, yb"""
-    residual_std: float | None
+    residual_std: Annotated[float | None, HandColumn()]
     """its standard deviation for a point contact: beyond a few of these, the contact is not a point"""
     begin_threshold_n: float
     """force above which a contact begins"""
@@ -128,26 +143,34 @@ class Contact:
     """`released`; `stale`, `lost`, `faulted` or `off` as its pad; `restarted` (the node), `stopped` (the
     daemon); empty before the end"""
     retained: bool
-    group: int = 0
+    group: Annotated[int, HandColumn("as in `contact`, 0 without contact")] = 0
     """the same for contacts on one hand that are so close that one object may bridge them; the id of one of
     its contacts, constant while any of them lasts"""
-    palm_status: Annotated[FrameStatusName, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    palm_status: Annotated[FrameStatusName, FrameStatus, HandColumn("status in the palm's frame")] = (
+        FrameStatus.NOT_COMPUTED.text
+    )
     """status of the three that follow"""
-    palm_position_m: Vector3 | None = None
+    palm_position_m: Annotated[Vector3 | None, HandColumn("in the palm's frame")] = None
     """in the palm's frame, with the joint positions at the sample; nil unless `palm_status` is `valid`"""
-    palm_normal: Vector3 | None = None
+    palm_normal: Annotated[Vector3 | None, HandColumn("outward unit normal, in the palm's frame")] = None
     """outward unit normal, in the palm's frame"""
-    palm_covariance_m2: Matrix3 | None = None
+    palm_covariance_m2: Annotated[
+        Matrix3 | None, HandColumn("covariance of `palm_position_m`, row by row")
+    ] = None
     """covariance of `palm_position_m`, row by row; includes the stated uncertainty of mounts and joints"""
-    base_status: Annotated[FrameStatusName, FrameStatus] = FrameStatus.NOT_COMPUTED.text
+    base_status: Annotated[FrameStatusName, FrameStatus, HandColumn("status in the base's frame")] = (
+        FrameStatus.NOT_COMPUTED.text
+    )
     """status of the three that follow"""
-    base_position_m: Vector3 | None = None
+    base_position_m: Annotated[Vector3 | None, HandColumn("in the base's frame")] = None
     """in the base's frame"""
-    base_normal: Vector3 | None = None
+    base_normal: Annotated[Vector3 | None, HandColumn("outward unit normal, in the base's frame")] = None
     """outward unit normal, in the base's frame"""
-    base_covariance_m2: Matrix3 | None = None
+    base_covariance_m2: Annotated[
+        Matrix3 | None, HandColumn("covariance of `base_position_m`, row by row")
+    ] = None
     """covariance of `base_position_m`, row by row"""
-    joints_age_s: float | None = None
+    joints_age_s: Annotated[float | None, HandColumn()] = None
     """time from the sample to the nearest joint state, of the joint in between with the oldest one"""
     uncompensated_force_n: float | None = None
     """force by the contact law alone, without compensation of the sheet's behaviour; nil where none is
@@ -158,34 +181,39 @@ class Contact:
     fresh: bool = True
     """false while samples of the pad are missing: the contact continues with the values of its last sample,
     at `t_ns`; absent where true"""
-    force_vector_status: Annotated[ForceStatusName, ForceStatus] = ForceStatus.NOT_COMPUTED.text
+    force_vector_status: Annotated[
+        ForceStatusName,
+        ForceStatus,
+        HandColumn("as in `contact`; this and the following are empty for a hand without shear pads"),
+    ] = ForceStatus.NOT_COMPUTED.text
     """status of the force vector: `not_computed` of a pad without a shear pad; `lower_bound` and `unreliable`
     as `force_status`, `unreliable` also where `position_status` is, as with several contacts; `invalid` while
     the rest position of the shear pad isn't known, or if its currents are those of no displacement"""
-    force_vector_n: Vector3 | None = None
+    force_vector_n: Annotated[
+        Vector3 | None, HandColumn("force of the object on the pad, in the link's frame")
+    ] = None
     """force of the object on the pad, in the link's frame: tangential by the shear pad, normal `force_n`"""
-    force_vector_covariance_n2: Matrix3 | None = None
+    force_vector_covariance_n2: Annotated[
+        Matrix3 | None, HandColumn("its covariance, row by row; NaN where the status is LOWER_BOUND")
+    ] = None
     """its covariance, row by row; nil where the status is `lower_bound`"""
-    palm_force_vector_n: Vector3 | None = None
+    palm_force_vector_n: Annotated[Vector3 | None, HandColumn("the force in the palm's frame")] = None
     """the force in the palm's frame; nil unless `palm_status` is `valid`"""
-    base_force_vector_n: Vector3 | None = None
+    base_force_vector_n: Annotated[Vector3 | None, HandColumn("the force in the base's frame")] = None
     """the force in the base's frame"""
-    parts: Annotated[tuple[dict[str, Any], ...], tuple[ContactPart, ...]] = ()
+    parts: tuple[ContactPart, ...] = ()
     """two contacts, each in the place of the one before that was nearest, where the currents of a pad of
     six or more electrodes support two, not one, at the sheet's `pair_false_alarm`; then `position_m` and
     `force_n` are those of one contact that replaces both, and `position_status` isn't `valid`; absent
     otherwise"""
-    mount_covariance_m2: Matrix3 | None = None
+    mount_covariance_m2: Annotated[Matrix3 | None, HandColumn()] = None
     """part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
     the pad, so that the difference of two positions has the rest"""
 
 
 @dataclass(frozen=True, slots=True)
-class HandFrame:
-    """`hand/<hand>`: the whole hand as columns, one message per tick; one row per link.
-
-    Optional columns are empty where no scene requests them. Float columns are NaN where unknown.
-    """
+class HandFrameHead:
+    """First fields of `HandFrame`; the fields of `Contact` with a `HandColumn` follow."""
 
     v: int
     session: int
@@ -206,59 +234,6 @@ class HandFrame:
     """time of the row's sample, 0 before the first; its age is `t_ns` minus this"""
     total_current_a: Annotated[bytes, Column("<f4")]
     """total current of the newest sample"""
-    position_m: Annotated[bytes, Column("<f4", 3)]
-    """in the link's frame; this and the following are NaN without contact"""
-    normal: Annotated[bytes, Column("<f4", 3)]
-    """outward unit normal of the pad at the position"""
-    covariance_m2: Annotated[bytes, Column("<f4", 9)]
-    """covariance of `position_m`, row by row, with that of the mount"""
-    pad_m: Annotated[bytes, Column("<f4", 2)]
-    """arc lengths on the pad, from the electrodes x0 and y0"""
-    position_status: Annotated[bytes, Column("<u1", codes=PositionStatus)]
-    """status of the position"""
-    force_n: Annotated[bytes, Column("<f4")]
-    """normal force"""
-    force_std_n: Annotated[bytes, Column("<f4")]
-    """its standard deviation; NaN where `force_n` is a lower bound"""
-    force_status: Annotated[bytes, Column("<u1", codes=ForceStatus)]
-    """status of the force"""
-    residual: Annotated[bytes, Column("<f4")]
-    """as in `contact`"""
-    residual_std: Annotated[bytes, Column("<f4")]
-    """as in `contact`"""
-    retained: bool
-    group: Annotated[bytes, Column("<u4")] = b""
-    """as in `contact`, 0 without contact"""
-    palm_status: Annotated[bytes, Column("<u1", codes=FrameStatus)] = b""
-    """status in the palm's frame"""
-    palm_position_m: Annotated[bytes, Column("<f4", 3)] = b""
-    """in the palm's frame"""
-    palm_normal: Annotated[bytes, Column("<f4", 3)] = b""
-    """outward unit normal, in the palm's frame"""
-    palm_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
-    """covariance of `palm_position_m`, row by row"""
-    base_status: Annotated[bytes, Column("<u1", codes=FrameStatus)] = b""
-    """status in the base's frame"""
-    base_position_m: Annotated[bytes, Column("<f4", 3)] = b""
-    """in the base's frame"""
-    base_normal: Annotated[bytes, Column("<f4", 3)] = b""
-    """outward unit normal, in the base's frame"""
-    base_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
-    """covariance of `base_position_m`, row by row"""
-    joints_age_s: Annotated[bytes, Column("<f4")] = b""
-    """as in `contact`"""
-    force_vector_status: Annotated[bytes, Column("<u1", codes=ForceStatus)] = b""
-    """as in `contact`; this and the following are empty for a hand without shear pads"""
-    force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
-    """force of the object on the pad, in the link's frame"""
-    force_vector_covariance_n2: Annotated[bytes, Column("<f4", 9)] = b""
-    """its covariance, row by row; NaN where the status is LOWER_BOUND"""
-    palm_force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
-    """the force in the palm's frame"""
-    base_force_vector_n: Annotated[bytes, Column("<f4", 3)] = b""
-    """the force in the base's frame"""
-    mount_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
-    """as in `contact`"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ tables`). A field's docstring is its meaning. Metadata refine the type that the 
     state: Annotated[PadStateName, PadState]                   # texts of a status
     event: Annotated[Literal["begin", "end"], CLOSED]          # names
     force_n: Annotated[bytes, Column("<f4")]                   # a column
+    force_n: Annotated[float | None, HandColumn()]             # a number with a column of hand frames
     buses: Annotated[dict[str, Any], dict[str, BusStatistics]]     # maps inside of a map
 """
 
@@ -20,9 +21,9 @@ import types
 import typing
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
-from typing import Annotated, Any, Literal, NamedTuple, Union
+from typing import Annotated, Any, Literal, NamedTuple, NotRequired, Union
 
-from handtouch.wire.columns import Column
+from handtouch.wire.columns import Column, HandColumn
 
 
 class Values(NamedTuple):
@@ -50,6 +51,7 @@ class FieldDeclaration(NamedTuple):
     values: Values | None
     codes: type[Enum] | None
     """status codes, of a column or as text"""
+    hand_column: HandColumn | None = None
 
 
 def declared_fields(kind: type[Any]) -> tuple[FieldDeclaration, ...]:
@@ -80,13 +82,15 @@ def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, st
     column: Column | None = None
     values: Values | None = None
     codes: type[Enum] | None = None
-    is_closed = False
+    is_closed, hand_column = False, None
     is_nilable, hint = _without_none(hint)
     if typing.get_origin(hint) is Annotated:
         hint, *metadata = typing.get_args(hint)
         for extra in metadata:
             if isinstance(extra, Column):
                 column, codes = extra, extra.codes
+            elif isinstance(extra, HandColumn):
+                hand_column = extra
             elif extra is CLOSED:
                 is_closed = True
             elif isinstance(extra, type) and issubclass(extra, Enum):
@@ -100,12 +104,14 @@ def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, st
         hint = str
     meaning = meanings.get(name, "")
     return FieldDeclaration(
-        name, hint, is_nilable or also_nilable, is_optional, meaning, column, values, codes
+        name, hint, is_nilable or also_nilable, is_optional, meaning, column, values, codes, hand_column
     )
 
 
 def _without_none(hint: Any) -> tuple[bool, Any]:
     """Return whether a type includes None, and the type without it."""
+    if typing.get_origin(hint) is NotRequired:
+        (hint,) = typing.get_args(hint)
     if typing.get_origin(hint) not in (Union, types.UnionType):
         return False, hint
     (other,) = (argument for argument in typing.get_args(hint) if argument is not type(None))
@@ -116,7 +122,12 @@ def _docstrings(kind: type[Any]) -> dict[str, str]:
     """Return the docstrings of a class' attributes, each on one line."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     assert isinstance(definition, ast.ClassDef)
-    found = {}
+    found = {
+        name: text
+        for base in kind.__bases__
+        if is_dataclass(base)
+        for name, text in _docstrings(base).items()
+    }
     for attribute, text in zip(definition.body, definition.body[1:], strict=False):
         match attribute, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(docstring))):

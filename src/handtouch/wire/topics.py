@@ -13,7 +13,8 @@ from operator import attrgetter
 from typing import Any, cast
 
 from handtouch.wire.columns import Column, columns_of
-from handtouch.wire.contact import ACTION_REQUEST, PERCEPT_KINDS, Contact, HandFrame, Percept
+from handtouch.wire.contact import ACTION_REQUEST, PERCEPT_KINDS, Contact, Percept
+from handtouch.wire.hand_frame import HandFrame
 from handtouch.wire.health import Health, JointPositions
 from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs

@@ -8,28 +8,30 @@ Public names: `Stamper`, `encode_contacts`, `encode_wrench`, `encode_sum`, `enco
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from cyclonedds.idl.types import float64
 from scipy.spatial.transform import Rotation
 
 from handtouch import wire
 from handtouch.bridge.ros2 import messages as ros
 from handtouch.bridge.ros2.cdr import ENCAPSULATION, Layout
-from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
+from handtouch.bridge.ros2.contact_messages import ContactArray, RosContact, RosContactPart
+from handtouch.wire import ForceStatus, FrameStatus, PositionStatus, StatusCode
+from handtouch.wire.declarations import declared_fields
 
-_CONTACTS, _CONTACT, _WRENCH = Layout(ros.ContactArray), Layout(ros.RosContact), Layout(ros.WrenchStamped)
-_PART = Layout(ros.RosContactPart)
-_PART_VECTORS = (("position_m", 3), ("normal", 3), ("covariance_m2", 9))
-_UNKNOWN_2, _UNKNOWN_3, _UNKNOWN_9 = ((math.nan,) * count for count in (2, 3, 9))
-_EVENTS = {"begin": 0, "update": 1, "end": 2}
-_POSITION_UNRELIABLE, _FORCE_UNRELIABLE = int(PositionStatus.UNRELIABLE), int(ForceStatus.UNRELIABLE)
-_FRAME_UNKNOWN = int(FrameStatus.NOT_COMPUTED)
+_CONTACTS, _CONTACT, _WRENCH = Layout(ContactArray), Layout(RosContact), Layout(ros.WrenchStamped)
+_PART = Layout(RosContactPart)
+_EVENTS = {event: number for number, event in enumerate(typing.get_args(wire.ContactEvent))}
+_LATER: dict[type[StatusCode], int] = {
+    PositionStatus: PositionStatus.UNRELIABLE,
+    ForceStatus: ForceStatus.UNRELIABLE,
+    FrameStatus: FrameStatus.NOT_COMPUTED,
+}
 """Codes for a status that a later version added: such values may not be relied on."""
-_POSITION_STATUS = {status.text: int(status) for status in PositionStatus}
-_FORCE_STATUS = {status.text: int(status) for status in ForceStatus}
-_FRAME_STATUS = {status.text: int(status) for status in FrameStatus}
 
 OK, WARN, ERROR, STALE = range(4)
 """Levels of diagnostic_msgs/DiagnosticStatus"""
@@ -76,7 +78,7 @@ class Stamper:
 def encode_contacts(
     contacts: Sequence[wire.Contact], frame: wire.HandFrame, palm_link: str, stamper: Stamper
 ) -> bytes:
-    """Return the encoded `ros.ContactArray` of the contacts of a tick; what is unknown is NaN."""
+    """Return the encoded `ContactArray` of the contacts of a tick; what is unknown is NaN."""
     header = (*stamper.stamp(frame.t_ns), stamper.frame(palm_link))
     data = _CONTACTS.encode((*header, frame.session, frame.tick, frame.hand, len(contacts)))
     for contact in contacts:
@@ -86,68 +88,56 @@ def encode_contacts(
     return ENCAPSULATION + data
 
 
-def _contact_values(contact: wire.Contact, stamper: Stamper) -> tuple[Any, ...]:
-    """Return the values of the fields of `ros.RosContact`, in their order."""
-    return (
-        *stamper.stamp(contact.t_ns),
-        stamper.frame(contact.frame),
-        _EVENTS[contact.event],
-        contact.id,
-        contact.hand,
-        contact.link,
-        *stamper.stamp(contact.begin_ns),
-        contact.duration_s,
-        contact.age_s,
-        _POSITION_STATUS.get(contact.position_status, _POSITION_UNRELIABLE),
-        *(contact.position_m or _UNKNOWN_3),
-        *(contact.normal or _UNKNOWN_3),
-        *(contact.covariance_m2 or _UNKNOWN_9),
-        *(contact.pad_m or _UNKNOWN_2),
-        _FORCE_STATUS.get(contact.force_status, _FORCE_UNRELIABLE),
-        _number(contact.force_n),
-        _number(contact.force_std_n),
-        _number(contact.peak_force_n),
-        _number(contact.uncompensated_force_n),
-        contact.total_current_a,
-        _number(contact.residual),
-        _number(contact.residual_std),
-        contact.begin_threshold_n,
-        contact.end_threshold_n,
-        contact.calibration_id,
-        contact.end_reason,
-        contact.group,
-        _FRAME_STATUS.get(contact.palm_status, _FRAME_UNKNOWN),
-        *(contact.palm_position_m or _UNKNOWN_3),
-        *(contact.palm_normal or _UNKNOWN_3),
-        *(contact.palm_covariance_m2 or _UNKNOWN_9),
-        _FRAME_STATUS.get(contact.base_status, _FRAME_UNKNOWN),
-        *(contact.base_position_m or _UNKNOWN_3),
-        *(contact.base_normal or _UNKNOWN_3),
-        *(contact.base_covariance_m2 or _UNKNOWN_9),
-        _number(contact.joints_age_s),
-        contact.diagnoses,
-        contact.fresh,
-        _FORCE_STATUS.get(contact.force_vector_status, _FORCE_UNRELIABLE),
-        *(contact.force_vector_n or _UNKNOWN_3),
-        *(contact.force_vector_covariance_n2 or _UNKNOWN_9),
-        *(contact.palm_force_vector_n or _UNKNOWN_3),
-        *(contact.base_force_vector_n or _UNKNOWN_3),
-        *(contact.mount_covariance_m2 or _UNKNOWN_9),
-        len(contact.parts),
-    )
+def _contact_values(contact: wire.Contact, stamper: Stamper) -> list[Any]:
+    """Return the values of the fields of `RosContact`, in their order."""
+    values = [*stamper.stamp(contact.t_ns), stamper.frame(contact.frame), _EVENTS[contact.event]]
+    for name, convert in _CONTACT_FIELDS:
+        value = getattr(contact, name)
+        values += convert(value) if name != "begin_ns" else stamper.stamp(value)
+    return values
 
 
-def _part_values(part: Mapping[str, Any]) -> list[float]:
-    """Return the values of the fields of `ros.RosContactPart`, in their order; `part` is a
-    `wire.ContactPart`."""
-    values = [*_vectors(part, ""), _number(part["force_n"]), _number(part["force_std_n"])]
-    return [*values, *_vectors(part, "palm_"), *_vectors(part, "base_"), part.get("id", 0)]
+def _part_values(part: wire.ContactPart) -> list[Any]:
+    """Return the values of the fields of `RosContactPart`, in their order."""
+    return [value for name, convert in _PART_FIELDS for value in convert(part.get(name))]
 
 
-def _vectors(part: Mapping[str, Any], frame: str) -> Iterable[float]:
-    """Return position, normal and covariance in a frame; NaN where absent."""
-    for name, length in _PART_VECTORS:
-        yield from part.get(frame + name) or (math.nan,) * length
+def _converter(hint: Any, name: str) -> Callable[[Any], Iterable[Any]]:
+    """Return a function that returns the values of a field of a type; NaN where it is unknown."""
+    if name in _STATUS_CODES:
+        return _STATUS_CODES[name]
+    count = _LENGTHS.get(hint) or getattr(getattr(hint, "__metadata__", (None,))[0], "length", 0)
+    if count:
+        unknown = (math.nan,) * count
+        return lambda value: value or unknown
+    if hint is float64:
+        return lambda value: (math.nan if value is None else value,)
+    if name == "parts":
+        return lambda value: (len(value),)
+    return lambda value: (0 if value is None else value,)
+
+
+def _status_code(codes: type[StatusCode], later: int) -> Callable[[Any], Iterable[Any]]:
+    numbers = {status.text: int(status) for status in codes}
+    return lambda text: (numbers.get(text, later),)
+
+
+_LENGTHS: dict[Any, int] = {ros.Point: 3, ros.Vector3: 3}
+_STATUS_CODES = {
+    field.name: _status_code(codes, _LATER[codes])
+    for field in declared_fields(wire.Contact)
+    for codes in _LATER
+    if field.codes is codes
+}
+_CONTACT_FIELDS, _PART_FIELDS = (
+    [
+        ("begin_ns" if name == "begin" else name, _converter(hint, name))
+        for name, hint in typing.get_type_hints(kind, include_extras=True).items()
+        if name not in ("header", "event")
+    ]
+    for kind in (RosContact, RosContactPart)
+)
+"""Field of the wire, and its conversion, of each field of a ROS message behind header and event."""
 
 
 def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes:

@@ -1,7 +1,7 @@
 """ROS 2 messages as DDS types, by their mangled names `PACKAGE::msg::dds_::NAME_`.
 
-Fields and their order are those of the `.msg` files, which `clients/ros2/handtouch_msgs` has for
-`ContactArray`; no other definition decodes on the other side. Times are ROS times, units SI.
+Fields and their order are those of the `.msg` files; no other definition decodes on the other side. Those of
+`clients/ros2/handtouch_msgs` are in `contact_messages.py`. Times are ROS times, units SI.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import float32, float64, int32, sequence, uint8, uint32
 
 # Annotations are types, not text, which the base class can't resolve in all cases.
 
@@ -199,88 +199,3 @@ class DiagnosticArray(IdlStruct, typename="diagnostic_msgs::msg::dds_::Diagnosti
 
     header: Header = field(default_factory=Header)
     status: Annotated[Sequence[DiagnosticStatus], sequence(DiagnosticStatus)] = field(default_factory=list)
-
-
-@dataclass
-class RosContactPart(IdlStruct, typename="handtouch_msgs::msg::dds_::ContactPart_"):
-    """handtouch_msgs/ContactPart."""
-
-    position_m: Point
-    normal: Vector3
-    covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    force_n: float64
-    force_std_n: float64
-    palm_position_m: Point
-    palm_normal: Vector3
-    palm_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    base_position_m: Point
-    base_normal: Vector3
-    base_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    id: uint32
-
-
-@dataclass
-class RosContact(IdlStruct, typename="handtouch_msgs::msg::dds_::Contact_"):
-    """handtouch_msgs/Contact."""
-
-    header: Header
-    event: uint8
-    id: uint32
-    hand: str
-    link: str
-    begin: Time
-    duration_s: float64
-    age_s: float64
-    position_status: uint8
-    position_m: Point
-    normal: Vector3
-    covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    pad_m: Annotated[Sequence[float64], array(float64, 2)]
-    force_status: uint8
-    force_n: float64
-    force_std_n: float64
-    peak_force_n: float64
-    uncompensated_force_n: float64
-    total_current_a: float64
-    residual: float64
-    residual_std: float64
-    begin_threshold_n: float64
-    end_threshold_n: float64
-    calibration_id: str
-    end_reason: str
-    group: uint32
-    palm_status: uint8
-    palm_position_m: Point
-    palm_normal: Vector3
-    palm_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    base_status: uint8
-    base_position_m: Point
-    base_normal: Vector3
-    base_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    joints_age_s: float64
-    diagnoses: Annotated[Sequence[str], sequence(str)]
-    fresh: bool
-    force_vector_status: uint8
-    force_vector_n: Vector3
-    force_vector_covariance_n2: Annotated[Sequence[float64], array(float64, 9)]
-    palm_force_vector_n: Vector3
-    base_force_vector_n: Vector3
-    mount_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
-    parts: Annotated[Sequence[RosContactPart], sequence(RosContactPart)]
-
-
-@dataclass
-class ContactArray(IdlStruct, typename="handtouch_msgs::msg::dds_::ContactArray_"):
-    """handtouch_msgs/ContactArray."""
-
-    header: Header
-    session: uint64
-    tick: uint64
-    hand: str
-    contacts: Annotated[Sequence[RosContact], sequence(RosContact)]
-
-
-MESSAGE_TYPES: tuple[type[IdlStruct], ...] = (
-    *(WrenchStamped, RosJointState, MarkerArray, DiagnosticArray, ContactArray),
-)
-"""Types of topics."""

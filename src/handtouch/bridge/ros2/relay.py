@@ -16,6 +16,7 @@ from handtouch import wire
 from handtouch.bridge.ros2 import conversion
 from handtouch.bridge.ros2 import messages as ros
 from handtouch.bridge.ros2.conflation import Conflation
+from handtouch.bridge.ros2.contact_messages import ContactArray
 from handtouch.bridge.ros2.conversion import Stamper
 from handtouch.bridge.ros2.network import Quality, RosNetwork, RosWriter, ros_name
 from handtouch.client import Subscriber
@@ -197,7 +198,7 @@ class _HandRelay:
         self.longest_silence_s = MIN_AGE_LIMIT_S
         self._name, self._palm_link, self._stamper, self._network = name, palm_link, stamper, network
         self._root = ros_name(name)
-        self._contacts = network.writer(f"{self._root}/contacts", ros.ContactArray, Quality.STREAM)
+        self._contacts = network.writer(f"{self._root}/contacts", ContactArray, Quality.STREAM)
         self._markers = network.writer(f"{self._root}/markers", ros.MarkerArray, Quality.STATE)
         self._wrenches: dict[str, RosWriter] = {}
         self._tick_contacts: list[wire.Contact] = []

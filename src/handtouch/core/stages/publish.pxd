@@ -25,7 +25,7 @@ cdef class ContactColumns:
     @cython.locals(pad=Py_ssize_t, i=Py_ssize_t)
     cpdef publish(self)
 
-@cython.locals(before=Py_ssize_t, width=Py_ssize_t)
+@cython.locals(before=Py_ssize_t, width=Py_ssize_t, index=Py_ssize_t)
 cdef Py_ssize_t _published_index(ContactColumns columns, Py_ssize_t pad, Py_ssize_t i) noexcept
 @cython.locals(i=Py_ssize_t, finite=bint)
 cdef bint _are_finite(double[::1] values, Py_ssize_t first, Py_ssize_t count) noexcept
@@ -34,25 +34,26 @@ cdef bint _are_finite(double[::1] values, Py_ssize_t first, Py_ssize_t count) no
 cdef void _publish_contact(ContactColumns columns, Py_ssize_t pad) noexcept
 
 cdef class ContactEncoder:
-    cdef unsigned char[::1] position_status, force_status, has_sheet_model, texts, pad_texts, number_bytes
+    cdef unsigned char[::1] position_status, force_status, has_sheet_model, texts, pad_texts
     cdef unsigned char[::1] message, synchronous, palm_requested, base_requested, palm_status, base_status
     cdef unsigned char[::1] vector_status, conditions
     cdef unsigned int[::1] contact_id, group_id
     cdef long long[::1] text_ends, pad_text_ends, contact_seq, sample_ns, begin_ns, silent_ns
     cdef long long[::1] max_sample_period_ns, layout, integers
-    cdef double[::1] number, state, values, parts, part_frames, summed
-    cdef Py_ssize_t written, fields, row_count, part_rows, pad_text_count
-    @cython.locals(sample_ns='long long', begin_ns='long long', t_ns='long long', integers='long long[::1]',
-                   row=Py_ssize_t)
+    cdef double[::1] state, parts, part_frames, summed
+    cdef unsigned long long[::1] state_bits, summed_bits
+    cdef Py_ssize_t written, fields, row_count, part_rows, pad_text_count, first_value
+    @cython.locals(sample_ns='long long', begin_ns='long long', t_ns='long long', row=Py_ssize_t)
     cpdef Py_ssize_t encode_contact(
         self, Py_ssize_t pad, Py_ssize_t event, long long sync_ns, long long now_ns, Py_ssize_t end_reason,
         bint retained)
 
 @cython.locals(max_silent_ns='long long')
 cdef bint _is_fresh(ContactEncoder encoder, Py_ssize_t pad) noexcept
-@cython.locals(integers='long long[::1]', conditions='unsigned char[::1]', values='double[::1]',
-               first=Py_ssize_t, in_frames=bint, force=Py_ssize_t)
+@cython.locals(first=Py_ssize_t, in_frames=bint, force=Py_ssize_t)
 cdef void _read_statuses(ContactEncoder encoder, Py_ssize_t pad) noexcept
+@cython.locals(i=Py_ssize_t, finite=bint)
+cdef bint _are_known(ContactEncoder encoder, Py_ssize_t first, Py_ssize_t count) noexcept
 @cython.locals(at=Py_ssize_t, kind=Py_ssize_t, is_optional=bint, value='long long', name=Py_ssize_t)
 cdef void _write_field(ContactEncoder encoder, Py_ssize_t row, Py_ssize_t pad, Py_ssize_t number) noexcept
 @cython.locals(at=Py_ssize_t, absent=Py_ssize_t, count=Py_ssize_t, first=Py_ssize_t, size=Py_ssize_t, i=Py_ssize_t,
@@ -61,7 +62,7 @@ cdef void _write_numbers(ContactEncoder encoder, Py_ssize_t row, Py_ssize_t pad,
 @cython.locals(i=Py_ssize_t, known=bint)
 cdef void _sum_covariance(ContactEncoder encoder, Py_ssize_t first, Py_ssize_t mount) noexcept
 @cython.locals(fields=Py_ssize_t, number=Py_ssize_t, first=Py_ssize_t, header=Py_ssize_t, row=Py_ssize_t,
-               in_palm=bint, in_base=bint)
+               in_palm=bint, in_base=bint, palm=double, base=double)
 cdef void _write_parts(ContactEncoder encoder, Py_ssize_t pad) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _write_text(ContactEncoder encoder, Py_ssize_t begin, Py_ssize_t end) noexcept
@@ -71,5 +72,5 @@ cdef void _write_pad_text(ContactEncoder encoder, Py_ssize_t row) noexcept
 cdef void _write_byte(ContactEncoder encoder, Py_ssize_t byte) noexcept
 @cython.locals(size=Py_ssize_t, kind=Py_ssize_t, k=Py_ssize_t)
 cdef void _write_integer(ContactEncoder encoder, long long value) noexcept
-@cython.locals(k=Py_ssize_t)
-cdef void _write_double(ContactEncoder encoder, double value) noexcept
+@cython.locals(at=Py_ssize_t)
+cdef void _write_bits(ContactEncoder encoder, unsigned long long bits) noexcept

@@ -107,7 +107,8 @@ def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
     """Return the position of a pad's value i in the published columns."""
     before = columns.value_columns[_VALUE_NUMBERS * i]
     width = columns.value_columns[_VALUE_NUMBERS * i + 1]
-    return columns.pads * before + pad * width + i - before
+    index: int = columns.pads * before + pad * width + i - before
+    return index
 
 
 def _are_finite(values: memoryview[float], first: int, count: int) -> bool:
@@ -161,18 +162,19 @@ class ContactEncoder:
     Among them are also `state`, the memory of all of them as numbers; position_status, force_status and
     has_sheet_model, (n,) of the pads; texts, packed keys of the fields, then names, and text_ends, where each
     begins, and the last ends; pad_texts, packed fields of the pads with keys, empty where they are absent,
-    and pad_text_ends; number, of which number_bytes is the memory; message, which is written; and working
-    memory: summed (9,), integers and conditions.
+    and pad_text_ends; message, which is written; and working memory: summed (9,), integers and conditions.
+    state_bits, summed_bits: the numbers of state and summed as integers of their bits.
 
     layout: (6 m,), of each field its number in FIELD_KINDS; that in CONDITIONS; 0 if it is always present, 1
     if it is absent where it is unknown, 2 where its condition isn't met; of numbers their first place in the
     state, the step from one pad to the next, and their count, 0 of a single number; of others the first of
     their names, their default, and their number in INTEGERS. Behind the `fields` of a contact are those of
-    one of two contacts on a pad, with the step from one to the next.
+    one of two contacts on a pad, with the step from one to the next. first_value: place in the state of the
+    first row of values.
     """
 
-    def __init__(self, fields: int, pad_text_count: int, arrays: Mapping[str, Any]) -> None:
-        self.row_count, self.pad_text_count = fields, pad_text_count
+    def __init__(self, fields: int, pad_text_count: int, first_value: int, arrays: Mapping[str, Any]) -> None:
+        self.row_count, self.pad_text_count, self.first_value = fields, pad_text_count, first_value
         self.layout, self.state, self.summed = arrays["layout"], arrays["state"], arrays["summed"]
         self.integers, self.conditions = arrays["integers"], arrays["conditions"]
         self.part_rows = len(self.layout) // _ROW_COUNT - fields
@@ -180,11 +182,11 @@ class ContactEncoder:
         self.has_sheet_model = arrays["has_sheet_model"]
         self.texts, self.text_ends = arrays["texts"], arrays["text_ends"]
         self.pad_texts, self.pad_text_ends = arrays["pad_texts"], arrays["pad_text_ends"]
-        self.number, self.number_bytes = arrays["number"], arrays["number_bytes"]
+        self.state_bits, self.summed_bits = arrays["state_bits"], arrays["summed_bits"]
         self.message = arrays["message"]
         self.contact_seq, self.contact_id = arrays["contact_seq"], arrays["contact_id"]
         self.sample_ns, self.begin_ns = arrays["sample_ns"], arrays["begin_ns"]
-        self.values, self.group_id = arrays["values"], arrays["group_id"]
+        self.group_id = arrays["group_id"]
         self.silent_ns, self.synchronous = arrays["silent_ns"], arrays["synchronous"]
         self.max_sample_period_ns = arrays["max_sample_period_ns"]
         self.palm_requested, self.base_requested = arrays["palm_requested"], arrays["base_requested"]
@@ -201,13 +203,13 @@ class ContactEncoder:
         event: 0 begin, 1 update, 2 end. sync_ns: of the tick in which the contact ended. end_reason: number
         of its name.
         """
-        sample_ns, begin_ns, integers = self.sample_ns[pad], self.begin_ns[pad], self.integers
+        sample_ns, begin_ns = self.sample_ns[pad], self.begin_ns[pad]
         t_ns = sync_ns if event == _END else sample_ns
-        integers[_SEQ], integers[_T], integers[_EVENT] = self.contact_seq[pad], t_ns, event
-        integers[_ID], integers[_BEGIN] = self.contact_id[pad], begin_ns
-        integers[_DURATION], integers[_AGE] = t_ns - begin_ns, now_ns - sample_ns
-        integers[_REASON], integers[_RETAINED] = end_reason, retained
-        integers[_FRESH] = _is_fresh(self, pad)
+        self.integers[_SEQ], self.integers[_T], self.integers[_EVENT] = self.contact_seq[pad], t_ns, event
+        self.integers[_ID], self.integers[_BEGIN] = self.contact_id[pad], begin_ns
+        self.integers[_DURATION], self.integers[_AGE] = t_ns - begin_ns, now_ns - sample_ns
+        self.integers[_REASON], self.integers[_RETAINED] = end_reason, retained
+        self.integers[_FRESH] = _is_fresh(self, pad)
         _read_statuses(self, pad)
         self.written, self.fields = _HEADER_BYTES, 2  # v and session are with the first key
         for row in range(self.row_count):
@@ -224,25 +226,34 @@ def _is_fresh(encoder: ContactEncoder, pad: int) -> bool:
 
 def _read_statuses(encoder: ContactEncoder, pad: int) -> None:
     """Set group, statuses and conditions of a contact; in no frame where none is requested."""
-    integers, conditions, values, first = encoder.integers, encoder.conditions, encoder.values, pad * _VALUES
+    first = encoder.first_value + pad * _VALUES
     in_frames = encoder.palm_requested[pad] or encoder.base_requested[pad]
     force = encoder.force_status[pad]
-    integers[_POSITION_STATUS], integers[_FORCE_STATUS] = encoder.position_status[pad], force
-    integers[_GROUP] = encoder.group_id[pad] if in_frames else 0
-    integers[_PALM_STATUS] = encoder.palm_status[pad] if in_frames else _NOT_COMPUTED
-    integers[_BASE_STATUS] = encoder.base_status[pad] if in_frames else _NOT_COMPUTED
-    integers[_VECTOR_STATUS] = encoder.vector_status[pad]
-    conditions[_ALWAYS], conditions[_FRAMES] = True, in_frames
-    conditions[_LOCATED] = (
-        _are_finite(values, first + _POSITION, 3)
-        and _are_finite(values, first + _NORMAL, 3)
-        and _are_finite(values, first + _PAD_M, 2)
+    encoder.integers[_POSITION_STATUS], encoder.integers[_FORCE_STATUS] = encoder.position_status[pad], force
+    encoder.integers[_GROUP] = encoder.group_id[pad] if in_frames else 0
+    encoder.integers[_PALM_STATUS] = encoder.palm_status[pad] if in_frames else _NOT_COMPUTED
+    encoder.integers[_BASE_STATUS] = encoder.base_status[pad] if in_frames else _NOT_COMPUTED
+    encoder.integers[_VECTOR_STATUS] = encoder.vector_status[pad]
+    encoder.conditions[_ALWAYS], encoder.conditions[_FRAMES] = True, in_frames
+    encoder.conditions[_LOCATED] = (
+        _are_known(encoder, first + _POSITION, 3)
+        and _are_known(encoder, first + _NORMAL, 3)
+        and _are_known(encoder, first + _PAD_M, 2)
     )
-    conditions[_STD] = force in (_FORCE_VALID, _FORCE_UNRELIABLE)
-    conditions[_PALM] = integers[_PALM_STATUS] == _FRAME_VALID
-    conditions[_BASE] = integers[_BASE_STATUS] == _FRAME_VALID
-    conditions[_MODELLED] = encoder.has_sheet_model[pad]
-    conditions[_VECTOR] = encoder.vector_status[pad] != _NOT_COMPUTED
+    encoder.conditions[_STD] = force in (_FORCE_VALID, _FORCE_UNRELIABLE)
+    encoder.conditions[_PALM] = encoder.integers[_PALM_STATUS] == _FRAME_VALID
+    encoder.conditions[_BASE] = encoder.integers[_BASE_STATUS] == _FRAME_VALID
+    encoder.conditions[_MODELLED] = encoder.has_sheet_model[pad]
+    encoder.conditions[_VECTOR] = encoder.vector_status[pad] != _NOT_COMPUTED
+
+
+def _are_known(encoder: ContactEncoder, first: int, count: int) -> bool:
+    """Return True if all of these numbers of the state are finite."""
+    finite = True
+    for i in range(first, first + count):
+        if not -_INFINITY < encoder.state[i] < _INFINITY:
+            finite = False
+    return finite
 
 
 def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> None:
@@ -265,7 +276,8 @@ def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> No
         if kind == _INTEGER:
             _write_integer(encoder, value)
         elif kind == _SECONDS:
-            _write_double(encoder, value * _SECONDS_PER_NS)
+            encoder.summed[0] = value * _SECONDS_PER_NS
+            _write_bits(encoder, encoder.summed_bits[0])
         elif kind == _NAME:
             name = encoder.layout[at + 3] + value
             _write_text(encoder, encoder.text_ends[name], encoder.text_ends[name + 1])
@@ -281,10 +293,10 @@ def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> 
     is_met = encoder.conditions[encoder.layout[at + 1]]
     if not is_met and absent:
         return
-    is_known = is_met and _are_finite(encoder.state, first, size)
+    is_known = is_met and _are_known(encoder, first, size)
     is_sum = encoder.layout[at] == _SUM
     if is_known and is_sum:
-        _sum_covariance(encoder, first, pad * _VALUES + _MOUNT)
+        _sum_covariance(encoder, first, encoder.first_value + pad * _VALUES + _MOUNT)
         is_known = _are_finite(encoder.summed, 0, size)
     if not is_known and absent == 1:
         return
@@ -298,16 +310,16 @@ def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> 
     if count:
         _write_byte(encoder, 0x90 + count)
     for i in range(size):
-        _write_double(encoder, encoder.summed[i] if is_sum else encoder.state[first + i])
+        _write_bits(encoder, encoder.summed_bits[i] if is_sum else encoder.state_bits[first + i])
 
 
 def _sum_covariance(encoder: ContactEncoder, first: int, mount: int) -> None:
     """Set `summed` to a covariance on the pad, plus that of its mount, if the pad's contact has one."""
-    known = _are_finite(encoder.values, mount, 9)
+    known = _are_known(encoder, mount, 9)
     for i in range(9):
         encoder.summed[i] = encoder.state[first + i]
         if known:
-            encoder.summed[i] += encoder.values[mount + i]
+            encoder.summed[i] += encoder.state[mount + i]
 
 
 def _write_parts(encoder: ContactEncoder, pad: int) -> None:
@@ -317,10 +329,9 @@ def _write_parts(encoder: ContactEncoder, pad: int) -> None:
     _write_byte(encoder, 0x92)
     for number in range(2 * pad, 2 * pad + 2):
         first = number * _PART_FRAMES
-        encoder.conditions[_PART_PALM] = in_palm and _are_finite(encoder.part_frames, first, 1)
-        encoder.conditions[_PART_BASE] = in_base and _are_finite(
-            encoder.part_frames, first + _FRAME_VALUES, 1
-        )
+        palm, base = encoder.part_frames[first], encoder.part_frames[first + _FRAME_VALUES]
+        encoder.conditions[_PART_PALM] = in_palm and -_INFINITY < palm < _INFINITY
+        encoder.conditions[_PART_BASE] = in_base and -_INFINITY < base < _INFINITY
         encoder.fields, header = 0, encoder.written
         _write_byte(encoder, 0x80)
         for row in range(encoder.row_count, encoder.row_count + encoder.part_rows):
@@ -370,9 +381,16 @@ def _write_integer(encoder: ContactEncoder, value: int) -> None:
         _write_byte(encoder, value >> 8 * (size - 1 - k) & 0xFF)
 
 
-def _write_double(encoder: ContactEncoder, value: float) -> None:
-    encoder.number[0] = value
-    encoder.message[encoder.written] = 0xCB
-    for k in range(8):
-        encoder.message[encoder.written + 1 + k] = encoder.number_bytes[7 - k]
-    encoder.written += 9
+def _write_bits(encoder: ContactEncoder, bits: int) -> None:
+    """Write the number that has these bits."""
+    at = encoder.written
+    encoder.message[at] = 0xCB
+    encoder.message[at + 1] = bits >> 56 & 0xFF
+    encoder.message[at + 2] = bits >> 48 & 0xFF
+    encoder.message[at + 3] = bits >> 40 & 0xFF
+    encoder.message[at + 4] = bits >> 32 & 0xFF
+    encoder.message[at + 5] = bits >> 24 & 0xFF
+    encoder.message[at + 6] = bits >> 16 & 0xFF
+    encoder.message[at + 7] = bits >> 8 & 0xFF
+    encoder.message[at + 8] = bits & 0xFF
+    encoder.written = at + 9

@@ -1,13 +1,12 @@
 """Touch of a hand in a MuJoCo simulation: the arrays that the daemon would publish, without a bus or daemon.
 
-Public names: `TactileSensor`, `TactileReading`.
+Public name: `TactileSensor`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import CountSlab
 from handtouch.simulate.tactile.mujoco_contacts import NO_POINTS, ContactReader, LinkPoints
+from handtouch.simulate.tactile.reading import TactileReading
 from handtouch.simulate.tactile.simulated_pads import SimulatedPads
 from handtouch.simulate.worlds import WORLDS, World
 from handtouch.wire import PadState
@@ -26,56 +26,6 @@ _HANDS_PER_PIPELINE = 16
 """Environments that share a tick: enough to spread the cost of a call, and few enough for the caches"""
 _START_NS = 1_000_000_000
 _NOISE_SEEDS = 4096  # later ones repeat: times must not reach the hours in which drift matters
-
-
-@dataclass(frozen=True)
-class TactileReading:
-    """One sample of all pads: arrays (..., pads, ...), with a first axis for several environments.
-
-    All but `counts` are columns of the hand frame as published, described in docs/wire.md; NaN is unknown.
-    """
-
-    counts: NDArray[np.int64]
-    """(p, 4), counts of the electrodes x0, xa, y0, yb, as in `raw`"""
-    state: NDArray[np.uint8]
-    """(p,), `handtouch.wire.PadState`"""
-    contact_id: NDArray[np.uint32]
-    """(p,), 0 without contact"""
-    sample_ns: NDArray[np.int64]
-    """(p,), time of the sample"""
-    total_current_a: NDArray[np.float32]
-    """(p,)"""
-    position_m: NDArray[np.float32]
-    """(p, 3), in the link's frame"""
-    normal: NDArray[np.float32]
-    """(p, 3), outward"""
-    covariance_m2: NDArray[np.float32]
-    """(p, 3, 3), of `position_m`"""
-    mount_covariance_m2: NDArray[np.float32]
-    """(p, 3, 3), part of it by the pad's mount"""
-    pad_m: NDArray[np.float32]
-    """(p, 2), arc lengths on the pad"""
-    position_status: NDArray[np.uint8]
-    """(p,), `handtouch.wire.PositionStatus`"""
-    force_n: NDArray[np.float32]
-    """(p,), normal force"""
-    force_std_n: NDArray[np.float32]
-    """(p,)"""
-    force_status: NDArray[np.uint8]
-    """(p,), `handtouch.wire.ForceStatus`"""
-    residual: NDArray[np.float32]
-    """(p,)"""
-    residual_std: NDArray[np.float32]
-    """(p,)"""
-
-    @property
-    def touched(self) -> NDArray[np.bool_]:
-        """Pads (p,) in contact."""
-        return np.not_equal(self.contact_id, 0)
-
-    def environment(self, number: int) -> Self:
-        """Return the reading of one of several environments."""
-        return type(self)(*(getattr(self, field.name)[number] for field in fields(self)))
 
 
 class TactileSensor:
@@ -237,7 +187,8 @@ class TactileSensor:
             )
             for name in parts[0]
         }
-        for name in ("covariance_m2", "mount_covariance_m2"):
+        matrices = [name for name in columns if wire.COLUMNS[wire.HandFrame][name].elements == 9]
+        for name in matrices:
             columns[name] = columns[name].reshape(self.environments, pads, 3, 3)
         return TactileReading(counts=counts, **columns)
 

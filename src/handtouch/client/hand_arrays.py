@@ -1,21 +1,21 @@
 """Arrays of a hand frame by link, and the wrenches of its contacts.
 
-Public names: `LinkColumn`, `StatusColumn`, `TouchedColumn`, `NotSampledError`, `HandArrays`.
+Public names: `FrameName`, `LinkColumns`, `HandArrays`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import Any, Generic, Literal, Self, TypeVar, cast, overload
+from typing import Any, Literal
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.client.names import link_hint
+from handtouch.client.frame_columns import FrameColumns
+from handtouch.client.link_column import FloatArray, FrameColumn, LinkColumn, StatusColumn, TouchedColumn
 from handtouch.client.wrench import (
     GraspMatrix,
     Wrench,
@@ -25,11 +25,8 @@ from handtouch.client.wrench import (
     turn_covariance,
 )
 
-T = TypeVar("T")
-StatusT = TypeVar("StatusT", bound=wire.StatusCode)
 FrameName = Literal["link", "palm", "base"]
 """Frame of positions, normals and wrenches: of each link, or of the links that the deployment names."""
-FloatArray = NDArray[np.float64]
 _COLUMNS = wire.COLUMNS[wire.HandFrame]
 _OF_PADS = ("state", "sampled", "sample_ns", "total_current_a", "joints_age_s")
 """Columns that also pads without a contact have a value in"""
@@ -37,224 +34,18 @@ SAMPLED_STATES = (wire.PadState.CLEAR, wire.PadState.TOUCHED)
 """States of pads of which it is known whether they are touched"""
 
 
-class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):
-    """One quantity of every pad: a read-only mapping from link to value, and an array in `array`.
-
-        hand.force_n["index_distal"]     # a number, or a row such as (3,) of position_m
-        hand.force_n.array               # (n,) or (n, elements), in the order of hand.links
-        hand.force_n * 2, hand.force_n.max()
-
-    numpy accepts it as an array, and arithmetic returns arrays. An unknown link raises KeyError naming the
-    closest one. `sum`, `mean`, `min` and `max` are over pads that have a contact, or may have one: clear pads
-    don't count, and pads that aren't sampled make the result NaN.
-    """
-
-    __slots__ = ("_rows", "array", "clear")
-
-    def __init__(
-        self, array: NDArray[Any], rows: Mapping[str, int], clear: NDArray[np.bool_] | None = None
-    ) -> None:
-        self.array = array
-        self.clear = np.zeros(len(array), np.bool_) if clear is None else clear
-        """(n,) pads that are sampled and have no contact, where the column is of contacts"""
-        self._rows = rows
-
-    def __getitem__(self, link: str) -> T:
-        value = self.array[self._row(link)]
-        return cast(T, value.item() if self.array.ndim == 1 else value)
-
-    def _row(self, link: str) -> int:
-        try:
-            return self._rows[link]
-        except (KeyError, TypeError):
-            if not isinstance(link, str):
-                names = ", ".join(self._rows)
-                raise TypeError(
-                    f"{link!r} is no link; the links are {names}, and rows of numbers are in .array"
-                ) from None
-            raise KeyError(f"no link {link!r}; {link_hint(link, self._rows)}") from None
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self.array, dtype=dtype, copy=copy)
-
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
-        arrays = (value.array if isinstance(value, LinkColumn) else value for value in inputs)
-        return getattr(ufunc, method)(*arrays, **options)
-
-    def __eq__(self, other: object) -> Any:
-        return dict(self) == dict(other) if isinstance(other, Mapping) else self.array == other
-
-    def __ne__(self, other: object) -> Any:
-        return dict(self) != dict(other) if isinstance(other, Mapping) else self.array != other
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def sum(self) -> Any:
-        """Return the sum, 0 without a contact; of rows by element."""
-        return self.array[~self.clear].sum(axis=0)
-
-    def mean(self) -> Any:
-        """Return the mean, NaN without a contact."""
-        return self._of_touched(np.mean)
-
-    def min(self) -> Any:
-        """Return the least value, NaN without a contact."""
-        return self._of_touched(np.min)
-
-    def max(self) -> Any:
-        """Return the greatest value, NaN without a contact."""
-        return self._of_touched(np.max)
-
-    def _of_touched(self, function: Callable[..., Any]) -> Any:
-        values = self.array[~self.clear]
-        return function(values, axis=0) if len(values) else np.full(self.array.shape[1:], np.nan)[()]
-
-    def __repr__(self) -> str:
-        return repr(dict(self))
-
-
-class StatusColumn(LinkColumn[StatusT]):
-    """A status of every pad; its values are codes that equal their names.
-
-    hand.force_status["index_distal"] == "valid"
-    hand.force_status == "valid"         # (n,) booleans
-    hand.force_status.array              # (n,) codes
-
-    """
-
-    __slots__ = ("_codes",)
-
-    def __init__(self, array: NDArray[Any], rows: Mapping[str, int], codes: type[StatusT]) -> None:
-        super().__init__(array, rows)
-        self._codes = codes
-
-    def __getitem__(self, link: str) -> StatusT:
-        code = int(self.array[self._row(link)])
-        try:
-            return self._codes(code)
-        except ValueError:  # of a later version
-            return cast(StatusT, code)
-
-    def __eq__(self, other: object) -> Any:
-        return super().__eq__(self._code(other))
-
-    def __ne__(self, other: object) -> Any:
-        return super().__ne__(self._code(other))
-
-    __hash__ = None
-
-    def _code(self, other: object) -> object:
-        """Return the code of a name. Raises ValueError for an unknown one, which would never be equal."""
-        if not isinstance(other, str):
-            return other
-        for code in self._codes:
-            if str(code) == other:
-                return code
-        raise ValueError(f"{other!r} is no status; they are {', '.join(map(str, self._codes))}")
-
-    def __repr__(self) -> str:
-        return repr({link: str(code) for link, code in self.items()})
-
-
-class NotSampledError(KeyError):
-    """A pad isn't sampled, so that nobody knows whether it is touched; the text has link, state and age."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])
-
-
-class TouchedColumn(LinkColumn[bool]):
-    """Whether each pad has a contact, where that is known.
-
-    hand.touched["index_distal"]        # raises NotSampledError where the pad isn't sampled
-    hand.touched.get("index_distal")    # None there
-    hand.touched.array                  # masked there
-
-    """
-
-    __slots__ = ("_reason",)
-
-    def __init__(
-        self, array: NDArray[Any], rows: Mapping[str, int], reason: Callable[[int], str] | None = None
-    ) -> None:
-        super().__init__(array, rows)
-        self._reason = reason or (lambda _: "its frame is old")
-
-    def __getitem__(self, link: str) -> bool:
-        row = self._row(link)
-        if np.ma.getmaskarray(self.array)[row]:
-            raise NotSampledError(f"whether {link!r} is touched isn't known: {self._reason(row)}")
-        return bool(self.array[row])
-
-    def __repr__(self) -> str:
-        return repr({link: self.get(link) for link in self})
-
-
-class _FrameColumn(Generic[T]):
-    """Attribute that returns a column of the newest frame; its name is the column's."""
-
-    def __init__(self, meaning: str) -> None:
-        self.__doc__ = meaning
-
-    def __set_name__(self, _: type, name: str) -> None:
-        self._name = name
-
-    @overload
-    def __get__(self, owner: None, _: type) -> Self: ...
-    @overload
-    def __get__(self, owner: LinkColumns, _: type) -> LinkColumn[T]: ...
-    def __get__(self, owner: LinkColumns | None, _: type) -> Self | LinkColumn[T]:
-        return self if owner is None else owner.column(self._name)
-
-
-class LinkColumns:
+class LinkColumns(FrameColumns):
     """The columns of `wire.HandFrame` by link, as attributes; a row per pad.
 
     Unknown values are NaN. Those of the palm and the base raise LookupError while no scene requests them, and
     force vectors for a hand without shear pads.
     """
 
-    state = _FrameColumn[wire.PadState]("State of the pad, a `wire.PadState`; only CLEAR means no contact.")
-    touched = _FrameColumn[bool](
+    touched = FrameColumn[bool](
         "True where the pad has a contact. Reading it of a pad that isn't sampled raises NotSampledError; "
         "`touched.get(link)` returns None there, and `touched.array` is masked."
     )
-    sampled = _FrameColumn[bool]("True where the pad is sampled, so that no contact means none.")
-    contact_id = _FrameColumn[int]("Id of the contact, 0 for none.")
-    sample_ns = _FrameColumn[int]("Time of the sample on the daemon's clock [ns], 0 before the first.")
-    total_current_a = _FrameColumn[float]("Total current of the newest sample [A].")
-    position_m = _FrameColumn[FloatArray]("(3,) contact position in the link's frame [m].")
-    normal = _FrameColumn[FloatArray]("(3,) outward unit normal of the pad at the position.")
-    covariance_m2 = _FrameColumn[FloatArray]("(3, 3) covariance of the position [m^2].")
-    mount_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) part of it by the pad's mount [m^2].")
-    pad_m = _FrameColumn[FloatArray]("(2,) arc lengths on the pad, from the electrodes x0 and y0 [m].")
-    position_status = _FrameColumn[wire.PositionStatus]("Status of the position, a `wire.PositionStatus`.")
-    force_n = _FrameColumn[float]("Normal force [N].")
-    force_std_n = _FrameColumn[float]("Its standard deviation [N]; NaN where the force is a lower bound.")
-    force_status = _FrameColumn[wire.ForceStatus]("Status of the force, a `wire.ForceStatus`.")
-    residual = _FrameColumn[float]("Deviation from a point contact, as in `wire.Contact`.")
-    residual_std = _FrameColumn[float]("Its standard deviation for a point contact.")
-    group = _FrameColumn[int]("The same for contacts that one object may bridge, 0 without contact.")
-    palm_status = _FrameColumn[wire.FrameStatus]("Status in the palm's frame, a `wire.FrameStatus`.")
-    palm_position_m = _FrameColumn[FloatArray]("(3,) contact position in the palm's frame [m].")
-    palm_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the palm's frame.")
-    palm_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) its covariance in the palm's frame [m^2].")
-    base_status = _FrameColumn[wire.FrameStatus]("Status in the base's frame, a `wire.FrameStatus`.")
-    base_position_m = _FrameColumn[FloatArray]("(3,) contact position in the base's frame [m].")
-    base_normal = _FrameColumn[FloatArray]("(3,) outward unit normal in the base's frame.")
-    base_covariance_m2 = _FrameColumn[FloatArray]("(3, 3) its covariance in the base's frame [m^2].")
-    joints_age_s = _FrameColumn[float]("Time from the sample to the nearest joint state [s].")
-    force_vector_status = _FrameColumn[wire.ForceStatus]("Status of the force vector, a `wire.ForceStatus`.")
-    force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the link's frame [N].")
-    force_vector_covariance_n2 = _FrameColumn[FloatArray]("(3, 3) its covariance [N^2].")
-    palm_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the palm's frame [N].")
-    base_force_vector_n = _FrameColumn[FloatArray]("(3,) force on the pad in the base's frame [N].")
+    sampled = FrameColumn[bool]("True where the pad is sampled, so that no contact means none.")
 
     def column(self, name: str) -> LinkColumn[Any]:
         """Return a column by its name. Raises LookupError while it isn't published."""
