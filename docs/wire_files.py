@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from docs.wire_tables import schema_text, with_tables
 from handtouch.core.stages.solve import VALUE_SLICES
-from handtouch.wire.columns import Column
+from handtouch.wire.columns import Column, vector_length
 from handtouch.wire.contact import Contact, ContactEvent, ContactPart, HandFrameHead
 from handtouch.wire.declarations import FieldDeclaration, declared_fields
 from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus, StatusCode
@@ -81,14 +81,7 @@ def hand_fields() -> list[HandField]:
 def _column_of(field: FieldDeclaration) -> Column:
     if field.codes is not None:
         return Column("<u1", codes=typing.cast(Any, field.codes))
-    return Column("<u4" if field.hint is int else "<f4", _length(field) or 1)
-
-
-def _length(field: FieldDeclaration) -> int:
-    """Return the number of elements of an array of numbers, 0 of anything else."""
-    arguments = typing.get_args(field.hint)
-    is_array = typing.get_origin(field.hint) is tuple and arguments[-1] is float
-    return len(arguments) if is_array else 0
+    return Column("<u4" if field.hint is int else "<f4", vector_length(field.hint) or 1)
 
 
 def _formatted(path: Path, text: str) -> str:
@@ -256,7 +249,7 @@ def _ros_field(field: FieldDeclaration) -> RosField:
     if field.name.endswith("_ns"):
         return RosField(field.name[:-3], "builtin_interfaces/Time", field.meaning)
     if typing.get_origin(field.hint) is tuple:
-        length = _length(field)
+        length = vector_length(field.hint)
         if length == 3:
             kind = "Point" if field.name.endswith("position_m") else "Vector3"
             return RosField(field.name, f"geometry_msgs/{kind}", field.meaning)
@@ -400,7 +393,7 @@ def _cpp_place(field: FieldDeclaration) -> tuple[str, str]:
 def _cpp_member(field: FieldDeclaration) -> str:
     if field.name == "parts":
         return "std::vector<ContactPart> parts"
-    length = _length(field)
+    length = vector_length(field.hint)
     if typing.get_origin(field.hint) is tuple and not length:
         return f"std::vector<std::string> {field.name}"
     kind = f"Vector<{length}>" if length else _CPP_SCALARS[field.hint]
@@ -494,7 +487,7 @@ def _js_type(field: FieldDeclaration) -> str:
     if field.name == "parts":
         return "ContactPart[]"
     if typing.get_origin(field.hint) is tuple:
-        kind = "number[]" if _length(field) else "string[]"
+        kind = "number[]" if vector_length(field.hint) else "string[]"
     elif field.name.endswith("_ns"):
         kind = "bigint"
     else:

@@ -33,6 +33,12 @@ def _values(hint: Any) -> st.SearchStrategy[Any]:
         if arguments[-1] is Ellipsis:
             return st.lists(_values(arguments[0]), max_size=4).map(tuple)
         return st.tuples(*map(_values, arguments))
+    if origin is list:
+        return st.lists(_values(arguments[0]), max_size=4)
+    if typing.is_typeddict(hint):
+        items = {name: _values(inner) for name, inner in typing.get_type_hints(hint).items()}
+        optional = {name: items.pop(name) for name in hint.__optional_keys__}
+        return st.fixed_dictionaries(items, optional=optional)
     if origin is dict:
         return st.dictionaries(names, st.one_of(integers, finite, names), max_size=3)
     return st.one_of(st.none(), *(_values(argument) for argument in arguments if argument is not type(None)))

@@ -8,6 +8,7 @@ Public names: `TABLES`, `rows_of`, `Rows`.
 from __future__ import annotations
 
 import json
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 
 from handtouch import wire
 from handtouch.record.recording import RecordedMessage, Recording
+from handtouch.wire.columns import vector_length
 
 TABLES = ("contacts", "raw", "hand", "health", "service", "joints")
 Row = dict[str, Any]
@@ -201,15 +203,12 @@ def _none_if_nan(value: Any) -> Any:
 
 def _vector_lengths() -> dict[str, int]:
     """Return the length of each vector field, by name, of the payloads in tables."""
-    hints = {"Vector3 | None": 3, "Matrix3 | None": 9, "tuple[float, float] | None": 2}
-    lengths: dict[str, int] = {}
-    for payload in (wire.Contact, wire.Health, wire.Service):
-        lengths |= {
-            name: hints[hint]
-            for name, hint in payload.__annotations__.items()
-            if isinstance(hint, str) and hint in hints
-        }
-    return lengths
+    hints = [
+        item
+        for payload in (wire.Contact, wire.Health, wire.Service)
+        for item in typing.get_type_hints(payload).items()
+    ]
+    return {name: length for name, hint in hints if (length := vector_length(hint))}
 
 
 _VECTOR_LENGTHS = _vector_lengths()

@@ -1,6 +1,6 @@
 """Columns: fields of a payload that hold one row per pad, as packed little-endian binary.
 
-Public names: `Column`, `HandColumn`, `columns_of`, `is_array`.
+Public names: `Column`, `HandColumn`, `columns_of`, `is_array`, `vector_length`.
 
 A payload declares a column by annotating a `bytes` field: `force_n: Annotated[bytes, Column("<f4")]`.
 """
@@ -72,6 +72,15 @@ class HandColumn:
 def is_array(hint: Any) -> bool:
     """Return True for the type of a numpy array, without importing numpy (2.5 has an alias)."""
     return getattr(typing.get_origin(hint), "__name__", "") in ("ndarray", "NDArray")
+
+
+def vector_length(hint: Any) -> int:
+    """Return the number of elements of a vector of numbers, which may be None; 0 of another type."""
+    for option in (hint, *typing.get_args(hint)):
+        items = typing.get_args(option)
+        if typing.get_origin(option) is tuple and set(items) == {float}:
+            return len(items)
+    return 0
 
 
 def columns_of(payload: type[Any]) -> dict[str, Column]:
