@@ -241,7 +241,7 @@ def _ros_field(field: FieldDeclaration) -> RosField:
     if field.name == "t_ns":
         return RosField("header", "std_msgs/Header", "time of the sample, frame of the link")
     if field.name == "parts":
-        return RosField("parts", "ContactPart[]", "two contacts at once, in the same order while they last; empty for one")
+        return RosField("parts", "ContactPart[]", "two contacts at once, in the same order; empty for one")
     if field.codes is not None:
         return RosField(field.name, "uint8", f"{_ROS_PREFIXES[typing.cast(Any, field.codes)]}_*")
     if field.name == "event":

@@ -118,7 +118,7 @@ def _random_messages(count: int) -> Iterator[wire.Message]:
         sizes = {"position_m": 3, "normal": 3, "covariance_m2": 9}
         frames = [prefix for prefix in ("", "palm_", "base_") if not prefix or rng.random() < 0.5]
         vectors = {f"{frame}{name}": real(size).tolist() for frame in frames for name, size in sizes.items()}
-        return typing.cast(wire.ContactPart, {"force_n": maybe(), "force_std_n": maybe(), **vectors})
+        return typing.cast(wire.ContactPart, {"force_n": maybe(), "force_std_n": maybe(), "id": 1, **vectors})
 
     def pick(codes: Any) -> Any:
         return list(codes)[rng.integers(len(codes))].text

@@ -1,7 +1,7 @@
 cimport cython
 
 cdef Py_ssize_t _VALUES, _PAD_M, _POSITION, _NORMAL, _COVARIANCE, _MOUNT, _FORCE, _FORCE_STD
-cdef Py_ssize_t _ESTIMATE, _MISFIT, _IS_BOUND, _FRAME_VALID, _END, _HEADER_BYTES, _ROW_COUNT, _VALUE_NUMBERS
+cdef Py_ssize_t _ESTIMATE, _MISFIT, _IS_BOUND, _FRAME_VALID, _END, _HEADER_BYTES, _NUMBER_BYTES, _ROW_COUNT, _VALUE_NUMBERS
 cdef Py_ssize_t _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID
 cdef Py_ssize_t _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID, _EVIDENCE_MISSING
 cdef Py_ssize_t _PARTS_COUNT, _FRAME_VALUES, _PART_FRAMES
@@ -57,20 +57,21 @@ cdef bint _are_known(ContactEncoder encoder, Py_ssize_t first, Py_ssize_t count)
 @cython.locals(at=Py_ssize_t, kind=Py_ssize_t, is_optional=bint, value='long long', name=Py_ssize_t)
 cdef void _write_field(ContactEncoder encoder, Py_ssize_t row, Py_ssize_t pad, Py_ssize_t number) noexcept
 @cython.locals(at=Py_ssize_t, absent=Py_ssize_t, count=Py_ssize_t, first=Py_ssize_t, size=Py_ssize_t, i=Py_ssize_t,
-               is_met=bint, is_known=bint, is_sum=bint)
+               is_met=bint, is_known=bint, is_sum=bint, message='unsigned char[::1]', end=Py_ssize_t)
 cdef void _write_numbers(ContactEncoder encoder, Py_ssize_t row, Py_ssize_t pad, Py_ssize_t number) noexcept
 @cython.locals(i=Py_ssize_t, known=bint)
 cdef void _sum_covariance(ContactEncoder encoder, Py_ssize_t first, Py_ssize_t mount) noexcept
 @cython.locals(fields=Py_ssize_t, number=Py_ssize_t, first=Py_ssize_t, header=Py_ssize_t, row=Py_ssize_t,
                in_palm=bint, in_base=bint, palm=double, base=double)
 cdef void _write_parts(ContactEncoder encoder, Py_ssize_t pad) noexcept
-@cython.locals(i=Py_ssize_t)
 cdef void _write_text(ContactEncoder encoder, Py_ssize_t begin, Py_ssize_t end) noexcept
-cdef void _write_key(ContactEncoder encoder, Py_ssize_t row) noexcept
 @cython.locals(i=Py_ssize_t)
+cdef void _copy(
+    unsigned char[::1] message, Py_ssize_t at, unsigned char[::1] texts, Py_ssize_t begin, Py_ssize_t end) noexcept
+cdef void _write_key(ContactEncoder encoder, Py_ssize_t row) noexcept
+@cython.locals(begin=Py_ssize_t, end=Py_ssize_t)
 cdef void _write_pad_text(ContactEncoder encoder, Py_ssize_t row) noexcept
 cdef void _write_byte(ContactEncoder encoder, Py_ssize_t byte) noexcept
 @cython.locals(size=Py_ssize_t, kind=Py_ssize_t, k=Py_ssize_t)
 cdef void _write_integer(ContactEncoder encoder, long long value) noexcept
-@cython.locals(at=Py_ssize_t)
-cdef void _write_bits(ContactEncoder encoder, unsigned long long bits) noexcept
+cdef void _write_bits(unsigned char[::1] message, Py_ssize_t at, unsigned long long bits) noexcept

@@ -27,7 +27,7 @@ _NOT_COMPUTED, _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVAL
 _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 _FRAME_VALID = int(FrameStatus.VALID)
 _END = 2  # number of the event
-_HEADER_BYTES, _ROW_COUNT, _VALUE_NUMBERS = 3, 6, 3
+_HEADER_BYTES, _NUMBER_BYTES, _ROW_COUNT, _VALUE_NUMBERS = 3, 9, 6, 3
 _FRAME_VALUES, _PART_FRAMES = FRAME_VALUES, 2 * FRAME_VALUES
 _PARTS_COUNT = PARTS_COUNT
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
@@ -277,7 +277,8 @@ def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> No
             _write_integer(encoder, value)
         elif kind == _SECONDS:
             encoder.summed[0] = value * _SECONDS_PER_NS
-            _write_bits(encoder, encoder.summed_bits[0])
+            _write_bits(encoder.message, encoder.written, encoder.summed_bits[0])
+            encoder.written += _NUMBER_BYTES
         elif kind == _NAME:
             name = encoder.layout[at + 3] + value
             _write_text(encoder, encoder.text_ends[name], encoder.text_ends[name + 1])
@@ -309,8 +310,11 @@ def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> 
         return
     if count:
         _write_byte(encoder, 0x90 + count)
+    message, end = encoder.message, encoder.written
     for i in range(size):
-        _write_bits(encoder, encoder.summed_bits[i] if is_sum else encoder.state_bits[first + i])
+        _write_bits(message, end, encoder.summed_bits[i] if is_sum else encoder.state_bits[first + i])
+        end += _NUMBER_BYTES
+    encoder.written = end
 
 
 def _sum_covariance(encoder: ContactEncoder, first: int, mount: int) -> None:
@@ -341,9 +345,13 @@ def _write_parts(encoder: ContactEncoder, pad: int) -> None:
 
 
 def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:
-    for i in range(begin, end):
-        encoder.message[encoder.written] = encoder.texts[i]
-        encoder.written += 1
+    _copy(encoder.message, encoder.written, encoder.texts, begin, end)
+    encoder.written += end - begin
+
+
+def _copy(message: memoryview[int], at: int, texts: memoryview[int], begin: int, end: int) -> None:
+    for i in range(end - begin):
+        message[at + i] = texts[begin + i]
 
 
 def _write_key(encoder: ContactEncoder, row: int) -> None:
@@ -354,9 +362,9 @@ def _write_key(encoder: ContactEncoder, row: int) -> None:
 def _write_pad_text(encoder: ContactEncoder, row: int) -> None:
     if encoder.pad_text_ends[row + 1] > encoder.pad_text_ends[row]:
         encoder.fields += 1
-    for i in range(encoder.pad_text_ends[row], encoder.pad_text_ends[row + 1]):
-        encoder.message[encoder.written] = encoder.pad_texts[i]
-        encoder.written += 1
+    begin, end = encoder.pad_text_ends[row], encoder.pad_text_ends[row + 1]
+    _copy(encoder.message, encoder.written, encoder.pad_texts, begin, end)
+    encoder.written += end - begin
 
 
 def _write_byte(encoder: ContactEncoder, byte: int) -> None:
@@ -381,16 +389,14 @@ def _write_integer(encoder: ContactEncoder, value: int) -> None:
         _write_byte(encoder, value >> 8 * (size - 1 - k) & 0xFF)
 
 
-def _write_bits(encoder: ContactEncoder, bits: int) -> None:
+def _write_bits(message: memoryview[int], at: int, bits: int) -> None:
     """Write the number that has these bits."""
-    at = encoder.written
-    encoder.message[at] = 0xCB
-    encoder.message[at + 1] = bits >> 56 & 0xFF
-    encoder.message[at + 2] = bits >> 48 & 0xFF
-    encoder.message[at + 3] = bits >> 40 & 0xFF
-    encoder.message[at + 4] = bits >> 32 & 0xFF
-    encoder.message[at + 5] = bits >> 24 & 0xFF
-    encoder.message[at + 6] = bits >> 16 & 0xFF
-    encoder.message[at + 7] = bits >> 8 & 0xFF
-    encoder.message[at + 8] = bits & 0xFF
-    encoder.written = at + 9
+    message[at] = 0xCB
+    message[at + 1] = bits >> 56 & 0xFF
+    message[at + 2] = bits >> 48 & 0xFF
+    message[at + 3] = bits >> 40 & 0xFF
+    message[at + 4] = bits >> 32 & 0xFF
+    message[at + 5] = bits >> 24 & 0xFF
+    message[at + 6] = bits >> 16 & 0xFF
+    message[at + 7] = bits >> 8 & 0xFF
+    message[at + 8] = bits & 0xFF
