@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from handtouch.client.link_columns import HandArrays
 
 from handtouch import wire
+from handtouch.client.link_columns import HandArrays
 from handtouch.learn import TouchFeatures
 from handtouch.record.lerobot import STATE, TOUCH, WINDOW, export_lerobot
 from handtouch.record.recording import Recording
