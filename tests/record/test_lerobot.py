@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.client.link_columns import HandArrays
+from handtouch.client.hand_arrays import HandArrays
 from handtouch.learn import TouchFeatures
 from handtouch.record.lerobot import STATE, TOUCH, WINDOW, export_lerobot
 from handtouch.record.recording import Recording
