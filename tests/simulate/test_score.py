@@ -125,8 +125,12 @@ def test_coverage_is_the_share_within_the_stated_intervals(ratio: float) -> None
     total = score_contacts(contacts, truth).total
     assert total.position_coverage == pytest.approx(1 - np.exp(-5.991 / 2 / ratio**2), abs=0.02)
     assert total.force_coverage == pytest.approx(erf(1.96 / ratio / np.sqrt(2)), abs=0.02)
-    unreliable = [replace(contact, position_status="unreliable") for contact in contacts]
-    assert np.isnan(score_contacts(unreliable, truth).total.position_coverage)
+    unreliable = [
+        replace(contact, position_status="unreliable", force_status="unreliable") for contact in contacts
+    ]
+    other = score_contacts(unreliable, truth).total
+    assert np.isnan(other.position_coverage)
+    assert (other.force_coverage, other.force_valid) == (total.force_coverage, 0.0)  # it has an interval, too
 
 
 def test_samples_match_within_half_a_period_and_ends_never() -> None:

@@ -76,7 +76,7 @@ class LinkScore:
     """Share of the `valid` positions on the pad within their stated 95 % region."""
     rms_force_error_n: float
     force_coverage: float
-    """Share of the `valid` forces within 1.96 of their stated standard deviations."""
+    """Share of the forces within 1.96 of their stated standard deviations, `unreliable` ones included."""
     position_valid: float
     """Share of the positions whose status is `valid`."""
     force_valid: float
@@ -114,9 +114,11 @@ class Score:
                 _interval_text(total.position_valid, total.position_coverage),
             ]
         if not np.isnan(total.rms_force_error_n):
+            held, valid = _percent(total.force_coverage), _percent(total.force_valid)
             lines += [
-                f"force: {total.rms_force_error_n:.2f} N rms error;",
-                _interval_text(total.force_valid, total.force_coverage),
+                f"force: {total.rms_force_error_n:.2f} N rms error, {held} of values in their 95 % intervals;",
+                f"  {valid} are valid, the others unreliable: a sheet counts as known",
+                "  after three touches of 5 s together",
             ]
         return "\n".join(lines)
 
@@ -209,14 +211,15 @@ class _MatchedLink:
             ]
         )
         forces = [
-            (c.force_n - record.force_n, c.force_std_n if c.force_status == "valid" else None)
+            (c.force_n - record.force_n, c.force_std_n, c.force_status == "valid")
             for c, record, _ in pairs
             if c.force_n is not None
         ]
-        self.force_error_n = np.array([error for error, _ in forces])
+        self.force_error_n = np.array([error for error, _, _ in forces])
         self.force_held = np.array(
-            [abs(error) <= _95_PERCENT_SIGMA * std for error, std in forces if std is not None]
+            [abs(error) <= _95_PERCENT_SIGMA * std for error, std, _ in forces if std is not None]
         )
+        self.force_valid = np.array([is_valid for _, _, is_valid in forces])
 
 
 def _vectors(rows: Iterable[FloatArray]) -> FloatArray:
@@ -259,10 +262,7 @@ def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
         _rms(np.concatenate([found.force_error_n for found in matched])),
         _mean(np.concatenate([found.force_held for found in matched])),
         _ratio(sum(len(found.position_held) for found in matched), len(length)),
-        _ratio(
-            sum(len(found.force_held) for found in matched),
-            sum(len(found.force_error_n) for found in matched),
-        ),
+        _mean(np.concatenate([found.force_valid for found in matched])),
         sum(found.touches for found in matched),
         sum(found.missed for found in matched),
         sum(found.false_positives for found in matched),
@@ -314,8 +314,9 @@ def _interval_text(valid: float, coverage: float) -> str:
 
 _LEGEND = """pos: samples with a position; rms errors in mm: pad, on the pad; link,
 mounts included; bound, the least possible by noise; max, the largest;
-N: rms error of force; in%: share of valid values within their 95 %
-intervals; miss, false: touches without contact, contacts without touch"""
+N: rms error of force; in%: share of valid positions, and of forces with
+an interval, within 95 %; miss: touches without contact; false: contacts
+without touch"""
 _COLUMNS = (
     ("pos", 5),
     ("pad", 5),
