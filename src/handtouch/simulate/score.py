@@ -116,7 +116,8 @@ class Score:
         if not np.isnan(total.rms_force_error_n):
             held, valid = _percent(total.force_coverage), _percent(total.force_valid)
             lines += [
-                f"force: {total.rms_force_error_n:.2f} N rms error, {held} of values in their 95 % intervals;",
+                f"force: {total.rms_force_error_n:.2f} N rms error;",
+                f"  {held} of values are in their 95 % intervals;",
                 f"  {valid} are valid, the others unreliable: a sheet counts as known",
                 "  after three touches of 5 s together",
             ]
