@@ -62,6 +62,17 @@ def test_an_unknown_link_is_reported_with_the_closest_one() -> None:
         arrays.force_n["q"]
 
 
+def test_an_unknown_link_is_never_a_pad_that_is_not_sampled() -> None:
+    arrays = HandArrays(make_frame(state=(CLEAR, TOUCHED, STALE)))
+    for shown in (arrays, arrays.as_old()):
+        assert shown.touched.get("index_base") is None
+        assert "index_base" in shown.touched
+        assert "indx_tip" not in shown.touched
+        for column in (shown.touched, shown.force_n, shown.state):
+            with pytest.raises(KeyError, match="did you mean 'index_tip'"):
+                column.get("indx_tip")
+
+
 def test_a_status_equals_its_name_and_prints_it() -> None:
     arrays = _arrays(
         _state_after(make_frame(state=(0, 1, 5), force_status=(0, 1, 2), position_status=(0, 1, 9)))
