@@ -99,9 +99,9 @@ SERVICE = wire.Service(
 )
 
 
-def _page(view: HandView, alive: bool = True, width: int = 120, height: int = 40) -> str:
+def _page(view: HandView, problem: str = "", width: int = 120, height: int = 40) -> str:
     console = Console(width=width, height=height, force_terminal=False)
-    view.alive = alive
+    view.problem = problem
     with console.capture() as captured:
         console.print(view, height=height)
     return captured.get()
@@ -140,8 +140,51 @@ def test_a_lost_node_is_shown_with_its_reason() -> None:
 
 
 def test_a_disconnected_daemon_differs_from_an_untouched_hand() -> None:
-    assert "disconnected" in _page(_view(HEALTH, SERVICE), alive=False)
-    assert "disconnected" not in _page(_view(HEALTH, SERVICE))
+    problem = (
+        "tcp://127.0.0.1:5581 is no stream of messages, perhaps a control endpoint; the live stream is X"
+    )
+    for width in (80, 120):
+        assert " ".join(_page(_view(), problem, width).replace("│", "").split()).count(problem) == 1
+        assert "nodes operational" not in _page(_view(HEALTH, SERVICE), problem, width)
+    assert "nodes operational" in _page(_view(HEALTH, SERVICE))
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_heading_has_no_cut_words_and_names_a_daemon_that_is_late(width: int) -> None:
+    late = replace(SERVICE, rate_hz=17.0, overruns=500, congestion_episodes={"live": 12_345})
+    page = _page(_view(HEALTH, late), width=width)
+    assert "17 of 200 ticks/s" in page
+    assert "…" not in page
+    idle = _page(_view(HEALTH, replace(SERVICE, rate_hz=74.0)), width=width)  # ticks that nobody needs
+    assert "   74 ticks/s" in idle
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_pads_that_change_together_are_one_event_with_its_whole_reason(width: int) -> None:
+    links = [f"middle_proximal_{k}" for k in range(12)]
+    pads = [replace(HEALTH, link=link) for link in links]
+    remedy = "as from every pad of bus can0; check that the nodes' programs run, and the host's load"
+    silent = [
+        replace(pad, node_state="stale", t_ns=pad.t_ns + k, reason=f"no sample for {20 + k} ms, {remedy}")
+        for k, pad in enumerate(pads)
+    ]
+    later = replace(pads[0], t_ns=pads[0].t_ns + 10**9)
+    begun = [replace(CONTACT, link=link, id=k) for k, link in enumerate(links[:2])]
+    page = " ".join(_page(_view(*pads, *silent, later, *begun), width=width).replace("│", "").split())
+    assert page.count("no sample for") == 1
+    assert "and 8 more: pad clear, node stale: no sample for 20 ms," in page
+    assert remedy in page
+    assert "middle_proximal_0: pad clear, node operational" in page
+    assert "#0 begins" in page
+    assert "#1 begins" in page
+
+
+def test_lines_in_a_terminal_keep_the_reason_of_a_pad(capsys: pytest.CaptureFixture[str]) -> None:
+    display = LineDisplay(columns=80)
+    display.show_message(replace(HEALTH, state="stale", reason="no sample for 36 ms; check the cable"))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert "no sample for 36 ms; check the cable" in " ".join(text.split())
 
 
 @pytest.mark.parametrize(

@@ -219,8 +219,8 @@ class _ContactCollector:
         if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
             self._display.show_message(message)
 
-    def refresh(self, alive: bool) -> None:
-        self._display.refresh(alive)
+    def refresh(self, problem: str) -> None:
+        self._display.refresh(problem)
 
     def __enter__(self) -> Self:
         self._display.__enter__()

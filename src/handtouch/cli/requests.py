@@ -22,8 +22,8 @@ from handtouch.client import request
 from handtouch.client.control import LONG_TIMEOUT_S, SHORT_TIMEOUT_S, SLOW_COMMANDS
 from handtouch.host.json_output import print_json
 from handtouch.host.user import user_name
+from handtouch.view.message_lines import names_text
 
-_MAX_NAMES = 4
 Reply = Mapping[str, Any]
 
 
@@ -229,10 +229,7 @@ def scene_lines(answer: Reply) -> Iterator[str]:
     for pad in answer["pads"]:
         alike.setdefault(_pad_text(pad), []).append(f"{pad['hand']}/{pad['link']}")
     for (computed, not_computed, clients), names in alike.items():
-        shown = ", ".join(names[:_MAX_NAMES]) + (
-            f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        )
-        yield f"{shown}: computed {computed}{clients}{not_computed}"
+        yield f"{names_text(names)}: computed {computed}{clients}{not_computed}"
 
 
 def _pad_text(pad: Reply) -> tuple[str, ...]:

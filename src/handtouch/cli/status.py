@@ -13,17 +13,21 @@ from rich.text import Text
 from handtouch.cli.requests import add_request, scene_lines, send_request
 from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.host.json_output import print_json
-from handtouch.view.message_lines import UNCALIBRATED_STATES, diagnosis_text
+from handtouch.view.message_lines import (
+    UNCALIBRATED_STATES,
+    diagnosis_text,
+    is_same_reason,
+    names_text,
+    tick_rate_text,
+)
 
 _Column = tuple[str, bool, Callable[[dict[str, Any]], str]]
 _LINK: _Column = ("link", False, lambda pad: f"{pad['hand']}/{pad['link']}")
 _STATE: _Column = ("state", False, lambda pad: pad["state"] + _calibration_note(pad))
 _RATE: _Column = ("Hz", True, lambda pad: f"{pad['rate_hz']:.0f}")
-_REASON: _Column = (
-    "reason",
-    False,
-    lambda pad: "; ".join(filter(None, [pad["reason"], *_active_errors(pad)])),
-)
+_REASON: _Column = ("reason", False, lambda pad: _reason(pad))
+_MIN_COMMON = 3
+"""Pads with one reason from which on it is printed once: it takes fewer lines then"""
 _COLUMNS = (_LINK, _STATE, _RATE, _REASON)
 """Columns of the table of pads: header, number, text of a pad."""
 _VERBOSE_COLUMNS = (
@@ -76,6 +80,9 @@ def print_status(answer: dict[str, Any], console: Console, verbose: bool = False
     """Print the reply to the control command `status`: a verdict, what is wrong, pads; `verbose`: all."""
     service = answer["service"]
     console.print(_verdict(answer), style="green" if is_all_ok(answer) else "red")
+    if " of " in _rate_text(service) and (late := service["loop"]["late"]):
+        part = max(late, key=lambda name: late[name])
+        console.print(f"ticks are late, mostly by {part}: docs/watch.md has the remedies", style="yellow")
     if verbose:
         _print_daemon(service, console)
     if not service["core_compiled"]:
@@ -101,10 +108,15 @@ def _verdict(answer: dict[str, Any]) -> str:
     causes = f" ({', '.join(f'{count} {state}' for state, count in faulty.items())})" if faulty else ""
     buses = ", ".join(f"{name} {100 * bus['load']:.0f} %" for name, bus in service["buses"].items())
     return (
-        f"{len(pads) - faulty.total()} of {len(pads)} pads ok{causes}, {service['rate_hz']:.0f} Hz"
+        f"{len(pads) - faulty.total()} of {len(pads)} pads ok{causes}, {_rate_text(service)} Hz"
         + (f", {buses}" if buses else "")
         + ("; calibrations can't be stored" if _store_error(answer) else "")
     )
+
+
+def _rate_text(service: dict[str, Any]) -> str:
+    names = ("rate_hz", "period_s", "overruns", "uptime_s")
+    return tick_rate_text(**{name: service[name] for name in names})
 
 
 def _print_daemon(service: dict[str, Any], console: Console) -> None:
@@ -112,7 +124,7 @@ def _print_daemon(service: dict[str, Any], console: Console) -> None:
     tick, loop, process = service["tick_us"], service["loop"], service["process"]
     console.print(
         f"handtouch {service['version']}, process {service['pid']}, up {service['uptime_s']:.0f} s: "
-        f"{service['ticks']} ticks at {service['rate_hz']:.0f} Hz, {service['overruns']} overruns"
+        f"{service['ticks']} ticks at {_rate_text(service)} Hz, {service['overruns']} overruns"
         + (f", tick {tick['p50']:.0f} us (p99 {tick['p99']:.0f}, max {tick['max']:.0f})" if tick else "")
     )
     episodes = _counts_text(service["congestion_episodes"])
@@ -156,14 +168,30 @@ def _print_bus(name: str, bus: dict[str, Any], console: Console, verbose: bool) 
 
 
 def _print_pads(pads: list[dict[str, Any]], console: Console, columns: Sequence[_Column]) -> None:
+    """Print a table of the pads, after the reasons that several have in common."""
+    common: list[tuple[str, list[str]]] = []
+    for pad in pads:
+        alike = next((names for reason, names in common if is_same_reason(reason, _reason(pad))), None)
+        if alike is None:
+            common.append((_reason(pad), alike := []))
+        alike.append(_LINK[2](pad))
+    once = {name for reason, names in common if reason and len(names) >= _MIN_COMMON for name in names}
+    for reason, names in common:
+        if names[0] in once:
+            console.print(f"{names_text(names)}: {reason}")
     table = make_table(
         *(header for header, _, _ in columns),
         right=[header for header, number, _ in columns if number],
         wrapped=("reason",),
     )
     for pad in pads:
-        table.add_row(*(text(pad) for _, _, text in columns))
+        short = "as above" if _LINK[2](pad) in once else _reason(pad)
+        table.add_row(*(short if column is _REASON else column[2](pad) for column in columns))
     print_table(console, table)
+
+
+def _reason(pad: dict[str, Any]) -> str:
+    return "; ".join(filter(None, [pad["reason"], *_active_errors(pad)]))
 
 
 def _active_errors(pad: dict[str, Any]) -> list[str]:

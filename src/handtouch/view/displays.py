@@ -6,6 +6,7 @@ Public names: `Display`, `LiveDisplay`, `LineDisplay`, `show_messages`.
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -18,6 +19,8 @@ from handtouch.view.message_lines import DISCONNECTED_TEXT, active_errors, messa
 
 _FRAMES_PER_S = 15
 _MAX_UPDATE_LINES_PER_S = 1
+_INDENT = 16 * " "
+"""of continued lines: the width of a time"""
 
 
 class Display(AbstractContextManager["Display"], Protocol):
@@ -26,8 +29,8 @@ class Display(AbstractContextManager["Display"], Protocol):
     def show_message(self, message: wire.Message) -> None:
         """Show a message, at once or with the next frame."""
 
-    def refresh(self, alive: bool) -> None:
-        """Redraw, `_FRAMES_PER_S` times a second; `alive`: the daemon is connected."""
+    def refresh(self, problem: str) -> None:
+        """Redraw, `_FRAMES_PER_S` times a second; `problem`: why no daemon is connected, "" while one is."""
 
 
 class LiveDisplay:
@@ -44,8 +47,8 @@ class LiveDisplay:
     def show_message(self, message: wire.Message) -> None:
         self._view.update(message)
 
-    def refresh(self, alive: bool) -> None:
-        self._view.alive = alive
+    def refresh(self, problem: str) -> None:
+        self._view.problem = problem
         self._live.refresh()
 
     def __enter__(self) -> Self:
@@ -59,7 +62,7 @@ class LiveDisplay:
 class LineDisplay:
     """One line per message; plain lines omit repetitions, JSON lines contain every message.
 
-    `columns`: width that plain lines are shortened to, None: not.
+    `columns`: width that plain lines are shortened to, and those with a reason wrapped at; None: not.
     """
 
     def __init__(self, as_json: bool = False, columns: int | None = None) -> None:
@@ -68,7 +71,7 @@ class LineDisplay:
         self._printed_ns: dict[tuple[str, str], int] = {}
         self._percepts: dict[tuple[str, str], tuple[str, str]] = {}
         self._health: dict[tuple[str, str], tuple[str, ...]] = {}
-        self._alive = True
+        self._has_problem = False
 
     def show_message(self, message: wire.Message) -> None:
         if self._as_json:
@@ -77,7 +80,10 @@ class LineDisplay:
         if self._has_changed(message):
             line = message_line(message)
             if self._columns is not None and len(line) > self._columns:
-                line = line[: self._columns - 1] + "…"
+                if isinstance(message, wire.Health):  # its reason and remedy are at the end
+                    line = textwrap.fill(line, self._columns, subsequent_indent=_INDENT)
+                else:
+                    line = line[: self._columns - 1] + "…"
             print(line, flush=True)
 
     def _has_changed(self, message: wire.Message) -> bool:
@@ -115,13 +121,10 @@ class LineDisplay:
             self._printed_ns[topic] = message.t_ns
         return True
 
-    def refresh(self, alive: bool) -> None:
-        if alive != self._alive:
-            self._alive = alive
-            print(
-                "daemon connected again" if alive else DISCONNECTED_TEXT,
-                file=sys.stderr,
-            )
+    def refresh(self, problem: str) -> None:
+        if bool(problem) != self._has_problem:
+            self._has_problem = bool(problem)
+            print(problem or "daemon connected again", file=sys.stderr)
 
     def __enter__(self) -> Self:
         return self
@@ -138,5 +141,6 @@ def show_messages(messages: Subscriber[wire.Message], display: Display, done: Ca
         if message is not None:
             display.show_message(message)
         if time.monotonic() >= next_frame_s:
-            display.refresh(messages.alive)
+            lost = DISCONNECTED_TEXT if messages.has_received else messages.connection.reason_of_silence
+            display.refresh("" if messages.alive else lost)
             next_frame_s = time.monotonic() + 1 / _FRAMES_PER_S

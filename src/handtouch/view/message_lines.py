@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from handtouch import wire
@@ -11,6 +11,29 @@ from handtouch import wire
 DISCONNECTED_TEXT = "daemon disconnected; start `handtouch run FILE` again"
 UNCALIBRATED_STATES = ("quarantined", "manual_required")
 """Calibration states of a pad whose forces aren't calibrated."""
+_FULL_RATE = 0.9
+"""Share of the nominal rate of ticks from which on the nominal one isn't named: one late tick in ten shows"""
+_BUSY_SHARE = 0.05
+"""Share of late periods of a daemon that is behind. With fewer a low rate is wanted: an idle hand has one"""
+_MAX_NAMES = 4
+_DIGITS = str.maketrans("", "", "0123456789.")
+
+
+def tick_rate_text(*, rate_hz: float, period_s: float, overruns: int, uptime_s: float) -> str:
+    """Format the rate of ticks of a `service` message: "200", or "17 of 200" where the daemon is late."""
+    is_behind = rate_hz * period_s < _FULL_RATE and overruns * period_s > _BUSY_SHARE * uptime_s
+    return f"{rate_hz:.0f}" + (f" of {1 / period_s:.0f}" if is_behind else "")
+
+
+def names_text(names: Sequence[str]) -> str:
+    """Format a list of pads: all of them, or the first ones and the number of the others."""
+    hidden = len(names) - _MAX_NAMES
+    return ", ".join(names[:_MAX_NAMES]) + (f" and {hidden} more" if hidden > 0 else "")
+
+
+def is_same_reason(reason: str, other: str) -> bool:
+    """Return True for texts that differ in their numbers only, as reasons of pads with one cause do."""
+    return reason.translate(_DIGITS) == other.translate(_DIGITS)
 
 
 def contact_line(contact: wire.Contact) -> str:

@@ -14,17 +14,19 @@ from rich.text import Text
 
 from handtouch import wire
 from handtouch.view.message_lines import (
-    DISCONNECTED_TEXT,
     UNCALIBRATED_STATES,
     force_text,
     health_news,
+    is_same_reason,
+    names_text,
     position_std_m,
+    tick_rate_text,
 )
 
 _MAX_EVENTS = 100
-_HEADER_ROWS = 2
-"""State of the daemon, and the titles of the columns"""
+_TITLE_ROWS = 1
 _FRAME_ROWS, _FRAME_COLUMNS = 2, 4
+_GAP = "   "
 _FULL_BAR_N = 5.0
 _BAR_CHARACTERS = 8
 _STYLE_OF_STATE = {
@@ -39,6 +41,28 @@ _STYLE_OF_STATE = {
 }
 _OK_STATES = ("clear", "touched", "off")
 _PadKey = tuple[str, str]
+_ONE_EVENT_S = 0.1
+"""Longest time between pads that change together: a tick at 10 Hz, the slowest that a hand is read at"""
+
+
+@dataclass
+class _Event:
+    """What happened to pads, in one line for those that it happened to together."""
+
+    t_ns: int
+    names: list[str]
+    text: str
+    style: str
+
+    def lines(self, console: Console, width: int) -> list[Text]:
+        """Return the text, wrapped at a width."""
+        head = f"{self.t_ns * 1e-9:12.3f}  "
+        text = Text(f"{names_text(self.names)}: {self.text}", self.style)
+        first, *others = text.wrap(console, max(1, width - len(head)))
+        return [
+            Text.assemble((head, "dim"), first),
+            *(Text.assemble(" " * len(head), line) for line in others),
+        ]
 
 
 class _TerminalColumn(NamedTuple):
@@ -53,14 +77,14 @@ class _TerminalColumn(NamedTuple):
 
 @dataclass
 class HandView:
-    """A rich renderable of the messages given to `update`; `alive`: the daemon is connected."""
+    """A rich renderable of the messages given to `update`; `problem`: why no daemon is connected."""
 
     title: str = "handtouch"
-    alive: bool = True
+    problem: str = ""
     _health: dict[_PadKey, wire.Health] = field(default_factory=dict)
     _contacts: dict[_PadKey, wire.Contact] = field(default_factory=dict)
     _service: wire.Service | None = None
-    _events: deque[Text] = field(default_factory=lambda: deque(maxlen=_MAX_EVENTS))
+    _events: deque[_Event] = field(default_factory=lambda: deque(maxlen=_MAX_EVENTS))
 
     def update(self, message: wire.Message) -> None:
         """Process a message of any topic."""
@@ -73,57 +97,72 @@ class HandView:
                 _untouched_state(message),
                 message.node_state,
             ):
-                text = f"{self._name(message)}: pad {_untouched_state(message)}, node {message.node_state}"
+                text = f"pad {_untouched_state(message)}, node {message.node_state}"
                 why = f": {message.reason}" if message.reason else ""
-                self._add_event(message.t_ns, text + why, _untouched_state(message))
+                self._add_event(message, text + why, _untouched_state(message), together=True)
             for text, status in health_news(before, message):
-                self._add_event(message.t_ns, f"{self._name(message)}: {text}", status)
+                self._add_event(message, text, status)
         elif isinstance(message, wire.Service):
             self._service = message
 
-    def __rich_console__(self, _: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the page, cut to the size of the console."""
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the page: as many pads and of the newest events as the console has room for."""
         rows = (options.height or options.size.height) - _FRAME_ROWS
         width = options.max_width - _FRAME_COLUMNS
-        header = self._header()
-        header.truncate(width, overflow="ellipsis")
-        event_rows = max(0, rows - _HEADER_ROWS - len(self._health))
-        events = list(self._events)[-event_rows:] if event_rows else []
-        for event in events:
-            event.truncate(width, overflow="ellipsis")
-        free_rows = rows - _HEADER_ROWS - len(events)
-        yield Panel(
-            Group(header, self._table(width, free_rows), *events), title=self.title, border_style="dim"
-        )
+        header = self._header(width).wrap(console, width)
+        rows -= len(header) + _TITLE_ROWS
+        events = self._event_lines(console, width, max(0, rows - len(self._health)))
+        table = self._table(width, rows - len(events))
+        yield Panel(Group(*header, table, *events), title=self.title, border_style="dim")
 
     def _update_contact(self, contact: wire.Contact) -> None:
         key = (contact.hand, contact.link)
         if contact.event == "end":
             self._contacts.pop(key, None)
             peak = "" if contact.peak_force_n is None else f", peak {contact.peak_force_n:.2f} N"
-            text = f"#{contact.id} {contact.end_reason} after {contact.duration_s:.2f} s{peak}"
             self._add_event(
-                contact.t_ns,
-                f"{self._name(contact)}: {text}",
+                contact,
+                f"#{contact.id} {contact.end_reason} after {contact.duration_s:.2f} s{peak}",
                 "touched" if contact.end_reason == "released" else "lost",
             )
             return
         self._contacts[key] = contact
         if contact.event == "begin":
-            self._add_event(contact.t_ns, f"{self._name(contact)}: #{contact.id} begins", "touched")
+            self._add_event(contact, f"#{contact.id} begins", "touched")
 
-    def _add_event(self, t_ns: int, text: str, state: str) -> None:
-        self._events.append(
-            Text.assemble((f"{t_ns * 1e-9:12.3f}  ", "dim"), (text, _STYLE_OF_STATE.get(state, "")))
-        )
+    def _add_event(
+        self, pad: wire.Health | wire.Contact, text: str, state: str, *, together: bool = False
+    ) -> None:
+        """Add an event; `together`: to the last one, if that is the same of other pads."""
+        name, last = self._name(pad), self._events[-1] if self._events else None
+        if (
+            together
+            and last is not None
+            and name not in last.names
+            and abs(pad.t_ns - last.t_ns) <= 1e9 * _ONE_EVENT_S
+            and is_same_reason(text, last.text)
+        ):
+            last.names.append(name)
+        else:
+            self._events.append(_Event(pad.t_ns, [name], text, _STYLE_OF_STATE.get(state, "")))
+
+    def _event_lines(self, console: Console, width: int, rows: int) -> list[Text]:
+        """Return the lines of the newest events, the oldest of them cut at the top."""
+        lines: list[Text] = []
+        for event in reversed(self._events):
+            if len(lines) >= rows:
+                break
+            lines = event.lines(console, width) + lines
+        return lines[max(0, len(lines) - rows) :]
 
     def _name(self, pad: wire.Health | wire.Contact) -> str:
         """Return the link, with its hand if there are several."""
         return pad.link if len({hand for hand, _ in self._health}) < 2 else f"{pad.hand}/{pad.link}"
 
-    def _header(self) -> Text:
-        if not self.alive:
-            return Text(DISCONNECTED_TEXT, style="bold red")
+    def _header(self, width: int) -> Text:
+        """Return the state of the daemon, as much of it as fits; the most important comes first."""
+        if self.problem:
+            return Text(self.problem, style="bold red")
         service = self._service
         if service is None:
             return Text("waiting for the daemon ...", style="dim")
@@ -131,15 +170,30 @@ class HandView:
         load = ", ".join(
             f"{name} {100 * bus.get('load', 0.0):.0f} %" for name, bus in sorted(service.buses.items())
         )
-        tick_us = service.tick_us.get("p50")
-        return Text.assemble(
-            (f"{up}/{len(self._health)} nodes operational", "green" if up == len(self._health) else "yellow"),
-            f"   touched {len(self._contacts)}",
-            f"   {service.rate_hz:.0f} ticks/s",
-            f"   bus load {load}",
-            f"   congestion episodes {sum(service.congestion_episodes.values())}",
-            f"   tick {tick_us:.0f} us" if tick_us is not None else "",
+        rate = tick_rate_text(
+            rate_hz=service.rate_hz,
+            period_s=service.period_s,
+            overruns=service.overruns,
+            uptime_s=service.uptime_s,
         )
+        tick_us = service.tick_us.get("p50")
+        episodes = sum(service.congestion_episodes.values())
+        parts = [
+            Text(
+                f"{up}/{len(self._health)} nodes operational",
+                "green" if up == len(self._health) else "yellow",
+            ),
+            Text(f"touched {len(self._contacts)}"),
+            Text(f"{rate} ticks/s", "yellow" if "of" in rate else ""),
+            Text(f"congestion episodes {episodes}" if episodes else ""),
+            Text(f"bus load {load}" if load else ""),
+            Text(f"tick {tick_us:.0f} us" if tick_us is not None else ""),
+        ]
+        line, *others = filter(None, parts)
+        for part in others:
+            if line.cell_len + len(_GAP) + part.cell_len <= width:
+                line = Text.assemble(line, _GAP, part)
+        return line
 
     def _table(self, width: int, free_rows: int) -> Table:
         names = {key: self._name(health) for key, health in self._health.items()}
