@@ -62,6 +62,26 @@ def test_options_of_every_command_are_parameters_of_its_function(name: str) -> N
     assert takes_any or options <= {parameter.name for parameter in named}
 
 
+@pytest.mark.parametrize("name", ALL_COMMANDS)
+def test_what_a_command_does_not_know_is_an_error_of_that_command(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parser = ALL_COMMANDS[name]
+    option = [action.option_strings[-1] for action in parser._actions if action.option_strings][-1]
+    with pytest.raises(SystemExit) as ended:
+        parser.parse_args([f"{option}x"])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"usage: handtouch {name}")
+    if "required" not in error:
+        assert f"did you mean {option}" in error
+
+
+def test_commands_of_a_deployment_s_buses_take_other_interfaces_for_them() -> None:
+    of_buses = ("run", "simulate", "check", "doctor", "scan", "conformance", "commission", "init")
+    assert all("--bus" in ALL_COMMANDS[name]._option_string_actions for name in of_buses)
+
+
 def test_scenario_names_in_help_are_those_shipped() -> None:
     assert tuple(SCENARIOS) == shipped.SCENARIO_NAMES
 

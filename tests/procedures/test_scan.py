@@ -228,6 +228,27 @@ def _send_heartbeats(bus: can.BusABC, can_id: int, stop: threading.Event) -> Non
         bus.send(can.Message(arbitration_id=can_id, data=[5], is_extended_id=False))
 
 
+@pytest.mark.parametrize("answers", [False, True])
+def test_another_program_that_asks_nodes_is_named_where_they_do_not_answer(
+    wire: VirtualBus, answers: bool
+) -> None:
+    if answers:
+        started(wire, 1)
+
+    def ask(stop: threading.Event) -> None:
+        other = wire.open()
+        while not stop.wait(0.005):  # a heartbeat, and a request of an object that nobody has
+            for can_id, data in ((0x711, [5]), (0x610, [0x40, 0, 0x99, 0, 0, 0, 0, 0])):
+                other.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    end = on_thread(ask)
+    try:
+        (report,) = scan_buses([wire.bus], QUICK)
+    finally:
+        end()
+    assert any("another program asks nodes" in problem for problem in report.problems) is not answers
+
+
 def test_hand_as_configured_has_no_problems(wire: VirtualBus) -> None:
     started(wire)
     expected = deployment(wire)
@@ -610,10 +631,13 @@ def test_init_from_a_scan_has_a_pad_for_every_node(wire: VirtualBus, tmp_path: P
     assert [bus.channel for bus in made.buses] == [wire.channel]
 
 
-def test_init_from_a_scan_without_nodes_writes_nothing(wire: VirtualBus, tmp_path: Path) -> None:
+def test_init_from_a_scan_without_nodes_writes_nothing(
+    wire: VirtualBus, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "hand.toml"
     assert cli.main(["init", "--from-scan", "--bus", wire.option, str(file)]) == 1
     assert not file.exists()
+    assert "check power, bit rate" in capsys.readouterr().err
 
 
 def test_text_lists_nodes_traffic_and_problems(wire: VirtualBus, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,9 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(path: Path, *, from_scan: bool, buses: Sequence[str]) -> int:
     """Write the file; exit status 0, 1 (no bus or node, or it can't be written), 2 (wrong usage)."""
-    found = _found(buses_to_scan(None, buses or [_DEFAULT_BUS]), from_scan)
+    found, problems = _found(buses_to_scan(None, buses or [_DEFAULT_BUS]), from_scan)
     if from_scan and not any(nodes for _, nodes in found):
-        raise CommandError("no node with four channels answered; see `handtouch scan`", 1)
+        raise CommandError("\n".join(["no node with four channels answered", *problems]), 1)
     if path.exists():
         raise CommandError(f"{path} exists; give the name of a new file", 2)
     with failing(1, OSError), path.open("x", encoding="utf-8") as file:
@@ -47,9 +47,11 @@ def run(path: Path, *, from_scan: bool, buses: Sequence[str]) -> int:
     return 0
 
 
-def _found(buses: Sequence[config.Bus], from_scan: bool) -> FoundNodes:
+def _found(buses: Sequence[config.Bus], from_scan: bool) -> tuple[FoundNodes, list[str]]:
+    """Return the nodes of each bus, and what the scan found wrong."""
     if not from_scan:
-        return [(bus, [_INVENTED_NODE]) for bus in buses]
+        return [(bus, [_INVENTED_NODE]) for bus in buses], []
     with ProgressLine() as progress:
         reports = scan_buses(buses, ScanRequest(), None, progress.update)
-    return [(report.bus, [node for node in report.nodes if channel_names(node)]) for report in reports]
+    nodes = [(report.bus, [node for node in report.nodes if channel_names(node)]) for report in reports]
+    return nodes, [problem for report in reports for problem in report.problems]

@@ -64,9 +64,15 @@ class CommandParser(SuggestingParser):
             getattr(importlib.import_module(module), name)(self)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Add the arguments and parse them."""
+        """Add the arguments and parse them. What this command doesn't know is an error, with its usage."""
         self.add_own_arguments()
-        return super().parse_known_args(args, namespace)
+        options, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            known = [text for action in self._actions for text in action.option_strings]
+            close = difflib.get_close_matches(unknown[0].partition("=")[0], known, 1)
+            hint = f"did you mean {close[0]}?" if close else f"see `{self.prog} --help`"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}; {hint}")
+        return options, unknown
 
 
 class PrintCompletion(argparse.Action):

@@ -107,6 +107,8 @@ def scan_bus(
     ]
     report.nodes.sort(key=lambda node: node.node_id)
     report.problems += _cob_id_conflicts(report)
+    if not passive:
+        report.problems += _other_client(report)
     counters = port.counters
     report.other_frames, report.error_frames = counters.unknown_frames, counters.error_frames
     if port.problem:
@@ -130,6 +132,16 @@ def _cob_id_conflicts(report: BusReport) -> Iterator[str]:
     for cob_id, names in users.items():
         if len(names) > 1:
             yield f"{report.bus.name}: COB-ID 0x{cob_id:X} is used by {' and '.join(names)}"
+
+
+def _other_client(report: BusReport) -> Iterator[str]:
+    """Yield that another SDO client was heard, if a node didn't answer: each takes the other's answers."""
+    asked = [can_id for can_id in report.streams if can_id - 0x600 in range(1, 128)]
+    if asked and any(node.error or not node.answers for node in report.nodes):
+        yield (
+            f"{report.bus.name}: another program asks nodes by SDO, and answers are mixed up; "
+            "if it is a daemon (`handtouch status`), stop it while you scan, or use --listen"
+        )
 
 
 def _listen(survey: BusSurvey, seconds: float, report: BusReport) -> None:
