@@ -160,7 +160,7 @@ ERRORS = {
     ),
     "wrong shape": (
         ('kind = "cylinder"', 'kind = "tube"'),
-        THUMB + 'surface.kind = "tube": needs kind = "cone", kind = "cylinder", kind = "outline",',
+        THUMB + 'surface.kind = "tube": must be "cone", "cylinder", "outline",',
     ),
     "wrong option": (
         ('channel = "can0"', 'channel = "can0"\noptions = { fd = [1] }'),
@@ -389,7 +389,7 @@ SHEAR_ERRORS = {
     ),
     "unknown pattern": (
         ('kind = "crossed_bars"', 'kind = "stripes"'),
-        'pattern.kind = "stripes": needs kind = "bars", kind = "crossed_bars", kind = "pinwheel" or kind',
+        'pattern.kind = "stripes": must be "bars", "crossed_bars", "pinwheel" or "discs"',
     ),
     "misspelt key of a pattern": (
         ("radius_mm = 2.0, gap_mm", "radius = 2.0, gap_mm"),

@@ -62,6 +62,7 @@ MOUNT = "mount = { position_mm = [26.0, 0.0, 12.5] }"
             robot(*AB, FIXED.replace("<parent", '<origin xyz="0 x 0"/><parent')),
             '<origin xyz="0 x 0"> must be 3 numbers',
         ),
+        (robot(*AB, '<xacro:property name="r" value="1"/>'), "has tags of xacro; convert it"),
     ],
 )  # fmt: skip
 def test_unusable_urdf_is_rejected_with_a_remedy(text: str, said: str) -> None:
@@ -77,6 +78,25 @@ def changed(tmp_path: Path, *changes: tuple[str, str], robot_text: str | None = 
     (tmp_path / "hand.toml").write_text(text)
     (tmp_path / "utah_mit.urdf").write_text(robot_text or shipped.path("utah_mit.urdf").read_text())
     return load(tmp_path / "hand.toml")
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("tip.stl", "file tip.stl not found; paths are relative to the URDF's folder"),
+        ("package://my_hand/tip.stl", "put the folder my_hand of its ROS package into"),
+        ("hand.toml", "hand.toml can't be read; convert it to STL, OBJ or COLLADA"),
+    ],
+)
+def test_a_mesh_that_is_not_used_is_named_with_a_remedy(tmp_path: Path, file: str, said: str) -> None:
+    pytest.importorskip("coal")
+    text = shipped.path("utah_mit.urdf").read_text()
+    shapes = re.compile(r'(<link name="thumb_distal">.*?<geometry>).*?(</geometry>)', re.DOTALL)
+    text, count = shapes.subn(rf'\1<mesh filename="{file}"/>\2', text, count=1)
+    assert count == 1
+    (why,) = unchecked_items(changed(tmp_path, robot_text=text))
+    assert why.startswith("right/thumb_distal: position on the link's body not checked: ")
+    assert said in why
 
 
 def test_shipped_hand_fits_its_urdf() -> None:

@@ -171,6 +171,15 @@ def test_plot_data_are_the_recorded_messages(recorded: Path) -> None:
     assert 0.5 <= min(times) <= max(times) <= 1.0
 
 
+def test_the_states_of_a_pad_are_as_many_spans_as_changes_however_many_messages() -> None:
+    messages = [(0.01 * k, "stale" if k // 100 % 2 else "clear") for k in range(1000)]
+    spans = plot.spans_of_states(messages, 12.0)
+    assert {state: len(found) for state, found in spans.items()} == {"clear": 5, "stale": 5}
+    assert sum(length_s for found in spans.values() for _, length_s in found) == pytest.approx(12.0)
+    assert spans["stale"][0] == pytest.approx((1.0, 1.0))
+    assert plot.spans_of_states([], 1.0) == {}
+
+
 def test_a_plot_without_data_is_status_1(
     tmp_path: Path, recorded: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

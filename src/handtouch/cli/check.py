@@ -59,16 +59,20 @@ def _measured(pad: dict[str, Any]) -> str:
     return f"up to {force_n:.3g} N (at {pad['measured_force_electrode']})"
 
 
+def _pads_text(count: int) -> str:
+    return f"{count} pad{'s' * (count != 1)}"
+
+
 def _print_summary(path: Path, facts: dict[str, Any], warnings: list[str]) -> None:
     print(f"{path}: {1e3 / facts['sync_period_ms']:.4g} Hz")
     for bus in facts["buses"]:
         print(
             f"  bus {bus['name']}: {bus['interface']} {bus['channel']}, "
-            f"{bus['bitrate_bit_s'] / 1e3:g} kbit/s, {bus['pads']} pads, "
+            f"{bus['bitrate_bit_s'] / 1e3:g} kbit/s, {_pads_text(bus['pads'])}, "
             f"load {bus['load']:.0%}, samples within {bus['burst_ms']:.2f} ms of SYNC"
         )
     for hand in facts["hands"]:
-        print(f"  hand {hand['name']}: {len(hand['pads'])} pads")
+        print(f"  hand {hand['name']}: {_pads_text(len(hand['pads']))}")
         for pad in hand["pads"]:
             length_mm, width_mm = pad["size_mm"]
             serial = "no serial" if pad["serial"] is None else f"serial {pad['serial']}"

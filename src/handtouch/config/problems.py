@@ -145,7 +145,8 @@ class _ValidationMistake:
             at = at if self.key_path else at.replace(".", ": ")
             kinds = self.kinds[_kind_table(self.path, self.kinds)]
             hint = suggest_name(str(given), list(kinds))
-            remedy = f"{hint}needs {_join_alternatives(f'kind = {_format_input(kind)}' for kind in kinds)}"
+            known = _join_alternatives(map(_format_input, kinds))
+            remedy = f"{hint}must be {known}" if given is not None else f"needs kind = {known}"
             return Problem(self.location + at, value, remedy)
         if self.error_type == "too_short" and len(self.error["input"]) >= context["min_length"]:
             return None  # pydantic also calls a list too short when all its entries are invalid

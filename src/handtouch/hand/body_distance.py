@@ -64,7 +64,9 @@ def unreadable_mesh(path: Path, scale: tuple[float, ...]) -> str:
         return ""
     with path.open("rb") as file:
         is_pointer = file.read(len(_LFS_POINTER)) == _LFS_POINTER
-    return f"{path} is a Git LFS pointer; run git lfs pull" if is_pointer else f"{path} can't be read"
+    if is_pointer:
+        return f"{path} is a Git LFS pointer; run git lfs pull"
+    return f"{path} can't be read; convert it to STL, OBJ or COLLADA"
 
 
 def _unit_m(path: Path) -> float:

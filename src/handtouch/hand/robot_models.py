@@ -155,6 +155,14 @@ def unchecked_items(deployment: Deployment) -> Iterator[str]:
                 yield f"{hand.name}/{pad.link}: position on the link's body not checked: {why}"
 
 
+def _place_of_mesh(file: str, folder: Path) -> str:
+    """Return where a mesh is searched."""
+    if file.startswith("package://"):
+        package = file.removeprefix("package://").partition("/")[0]
+        return f"put the folder {package} of its ROS package into {folder.resolve()}, or a folder above it"
+    return f"paths are relative to the URDF's folder, {folder.resolve()}"
+
+
 def _why_unchecked(robot: RobotDescription, shapes: Sequence[urdf.BodyShape]) -> str:
     """Return why some mesh of a body isn't known; empty if all are."""
     meshes = [shape for shape in shapes if shape.kind == "mesh"]
@@ -162,7 +170,11 @@ def _why_unchecked(robot: RobotDescription, shapes: Sequence[urdf.BodyShape]) ->
         return f"meshes are read with {extra_command('urdf')}"
     for mesh in meshes:
         path = find_mesh(mesh.file, robot.path.parent)
-        why = f"file {mesh.file} not found" if path is None else unreadable_mesh(path, mesh.size_m)
+        why = (
+            f"file {mesh.file} not found; {_place_of_mesh(mesh.file, robot.path.parent)}"
+            if path is None
+            else unreadable_mesh(path, mesh.size_m)
+        )
         if why:
             return why
     return ""

@@ -140,6 +140,8 @@ def parse_urdf(text: bytes | str, path: Path = Path("robot.urdf")) -> RobotDescr
     _remove_namespace(robot)
     if robot.tag != "robot":
         raise UrdfError(f"contains a <{robot.tag}> and no <robot>; give a URDF file")
+    if any("xacro}" in element.tag for element in robot.iter()):
+        raise UrdfError("has tags of xacro; convert it: xacro FILE.xacro > FILE")
     warnings: list[str] = []
     links: dict[str, tuple[BodyShape, ...]] = {}
     visible: dict[str, tuple[BodyShape, ...]] = {}

@@ -1,6 +1,6 @@
 """Figures of a recording for papers, as PDF (vectors) and PNG.
 
-Public names: `draw`, `read_plot_data`. Seconds are from the first message of the recording.
+Public names: `draw`, `read_plot_data`, `spans_of_states`. Seconds are from the first message of the recording.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import cycle
+from itertools import cycle, groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -338,12 +338,9 @@ def _draw_health(data: PlotData) -> Figure:
     )
     seen: dict[str, str] = {}
     for row, pad in enumerate(pads):
-        states = data.health.get(pad, [])
-        if not states:
-            continue
-        for (from_s, state), (to_s, _) in zip(states, [*states[1:], (data.end_s, "")], strict=True):
+        for state, spans in spans_of_states(data.health.get(pad, []), data.end_s).items():
             color = seen[state] = _COLOR_OF_STATE.get(state, _LINE_COLOR)
-            strip.broken_barh([(from_s, to_s - from_s)], (row - 0.4, 0.8), facecolors=color, linewidth=0)
+            strip.broken_barh(spans, (row - 0.4, 0.8), facecolors=color, linewidth=0)
     for row, pad in enumerate(pads):
         spans = [(c.times_s[0], c.times_s[-1] - c.times_s[0]) for c in data.contacts.get(pad, {}).values()]
         if spans:
@@ -362,6 +359,15 @@ def _draw_health(data: PlotData) -> Figure:
     fastest = max((hz for _, hz, *_ in data.service), default=1.0)
     rate.set(xlabel="time [s]", ylabel="ticks / s", ylim=(0, 1.15 * max(fastest, 1.0)))
     return figure
+
+
+def spans_of_states(states: list[tuple[float, str]], end_s: float) -> dict[str, list[tuple[float, float]]]:
+    """Return begin and length [s] of the spans in which a pad had each state; messages repeat states."""
+    spans: dict[str, list[tuple[float, float]]] = {}
+    runs = [next(run) for _, run in groupby(states, key=lambda entry: entry[1])]
+    for (from_s, state), (to_s, _) in pairwise([*runs, (end_s, "")]):
+        spans.setdefault(state, []).append((from_s, to_s - from_s))
+    return spans
 
 
 def _mark_increments(
