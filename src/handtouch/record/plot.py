@@ -1,6 +1,6 @@
 """Figures of a recording for papers, as PDF (vectors) and PNG.
 
-Public names: `draw`, `read_plot_data`, `spans_of_states`. Seconds are from the first message of the recording.
+Public names: `draw`, `read_plot_data`, `spans_of_states`. Seconds are from the recording's first message.
 """
 
 from __future__ import annotations
