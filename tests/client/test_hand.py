@@ -498,6 +498,7 @@ def test_columns_are_typed() -> None:
     def types(hand: handtouch.Hand) -> None:  # for mypy: never called
         assert_type(hand.force_n["x"], float)
         assert_type(hand.touched["x"], bool)
+        assert_type(hand.touched.get("x"), bool | None)
         assert_type(hand.contacts["x"].event, wire.ContactEvent)
         assert_type(handtouch.connect("hand/right").recv(), wire.HandFrame)
         assert_type(handtouch.connect("contact/left/*").recv(), wire.Contact)

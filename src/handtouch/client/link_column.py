@@ -16,6 +16,7 @@ from handtouch import wire
 from handtouch.client.names import link_hint
 
 T = TypeVar("T")
+DefaultT = TypeVar("DefaultT")
 StatusT = TypeVar("StatusT", bound=wire.StatusCode)
 FloatArray = NDArray[np.float64]
 
@@ -56,6 +57,24 @@ class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):
                     f"{link!r} is no link; the links are {names}, and rows of numbers are in .array"
                 ) from None
             raise KeyError(f"no link {link!r}; {link_hint(link, self._rows)}") from None
+
+    @overload
+    def get(self, link: str, /) -> T | None: ...
+    @overload
+    def get(self, link: str, /, default: T | DefaultT) -> T | DefaultT: ...
+    def get(self, link: str, /, default: Any = None) -> Any:
+        """Return the value, or `default` where it isn't known now.
+
+        Raises KeyError for an unknown link, which would be unknown for ever.
+        """
+        self._row(link)
+        try:
+            return self[link]
+        except NotSampledError:
+            return default
+
+    def __contains__(self, link: object) -> bool:
+        return link in self._rows
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)
