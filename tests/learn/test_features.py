@@ -62,7 +62,7 @@ def test_what_is_not_known_is_zero_and_its_flag_says_so(name: str) -> None:
     """A lower bound has a force, but no interval; nothing is ever NaN."""
     features = TouchFeatures(LINKS[:1])
     part = name.partition("_")[0]
-    missing = {"position_m": ((NAN,) * 3,) * 3, "force_n": (NAN,) * 3}
+    missing: dict[str, Any] = {"position_m": ((NAN,) * 3,) * 3, "force_n": (NAN,) * 3}
     found = shown(features, features.of(HandArrays(touching(**{name: missing[name]}))))
     assert found[f"{LINKS[0]}.{part}_known"] == found[f"{LINKS[0]}.{part}_valid"] == 0
     bound = touching(force_status=(ForceStatus.UNRELIABLE,) * 3, position_status=(2,) * 3)
@@ -123,7 +123,7 @@ def test_pads_are_chosen_by_link_and_an_unknown_one_is_named() -> None:
 
 
 def test_force_vectors_are_features_of_shear_pads() -> None:
-    vectors = {
+    vectors: dict[str, Any] = {
         "force_vector_status": (ForceStatus.VALID, 0, 0),
         "force_vector_n": ((0.1, -0.2, -1.0), (NAN,) * 3, (NAN,) * 3),
         "force_vector_covariance_n2": ((0.04, 0, 0, 0, 0, 0, 0, 0, 0), (NAN,) * 9, (NAN,) * 9),

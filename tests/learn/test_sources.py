@@ -51,8 +51,10 @@ def test_a_source_is_anything_with_the_columns(make_hand: Callable[..., Hand]) -
     hand.stroke(50)
     frame = next(m for m in reversed(hand.sink.messages) if isinstance(m, wire.HandFrame))
     arrays = HandArrays(frame)
-    names = ("state", "sample_ns", "position_m", "covariance_m2", "position_status")
-    names += ("force_n", "force_std_n", "force_status")
+    names = (
+        *("state", "sample_ns", "position_m", "covariance_m2", "position_status"),
+        *("force_n", "force_std_n", "force_status"),
+    )
     plain = SimpleNamespace(**{name: arrays.column(name).array for name in names}, t_ns=frame.t_ns)
     features = TouchFeatures(frame.links)
     assert features.of(plain, links=frame.links).tobytes() == features.of(arrays).tobytes()

@@ -122,7 +122,7 @@ class TouchFeatures:
             *(np.where(force_known, value, 0.0) for value in force_n),
             np.clip(age_s, 0.0, MAX_AGE_S),
         ]
-        filled = np.stack(columns, axis=-1).astype(np.float32)
+        filled: FloatArray = np.stack(columns, axis=-1).astype(np.float32)
         return filled.reshape(*filled.shape[:-2], self.size)
 
     def of_window(self, window: Any, samples: int) -> FloatArray:
@@ -171,7 +171,7 @@ class TouchFeatures:
 
 def _root_of_trace(covariance: NDArray[Any]) -> NDArray[Any]:
     """Return the root of the sum of variances; NaN of unknown ones."""
-    return np.sqrt(np.maximum(np.trace(covariance, axis1=-2, axis2=-1), 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.trace(covariance, axis1=-2, axis2=-1), 0.0)))
 
 
 def _measured(frame: Frame, vector: bool) -> tuple[Feature, ...]:

@@ -56,7 +56,8 @@ class _Episode:
         """Return the times of its frames: from the first sample, with joints from their first position on."""
         first_ns = max(self.frames[0].t_ns, self.joints_ns[0] if self.joints_ns else 0)
         count = int((self.frames[-1].t_ns - first_ns) * 1e-9 * fps) + 1
-        return first_ns + np.rint(np.arange(max(count, 0)) * (1e9 / fps)).astype(np.int64)
+        steps = np.rint(np.arange(max(count, 0)) * (1e9 / fps)).astype(np.int64)
+        return np.asarray(first_ns + steps)
 
 
 def export_lerobot(
@@ -289,7 +290,7 @@ class _DatasetWriter:
         import pyarrow
 
         index = "__index_level_0__"
-        described = [
+        described: list[dict[str, Any]] = [
             {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
             {"name": None, "field_name": index, "pandas_type": "unicode", "numpy_type": "object"},
         ]

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.spec import Identity, IdleSettings, NodeSpec
@@ -64,7 +65,8 @@ def identify_node(sdo: NodeSdoClient, expected: NodeSpec) -> Identification:
     identity = read_identity(sdo)
     for sub, (key, name) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
         if getattr(identity, key) is None and getattr(expected, key) is not None:
-            identity = replace(identity, **{key: sdo.read_or_none(cia301.IDENTITY, sub, name)})
+            again: dict[str, Any] = {key: sdo.read_or_none(cia301.IDENTITY, sub, name)}
+            identity = replace(identity, **again)
     return Identification(identity, read_errors(sdo))
 
 
