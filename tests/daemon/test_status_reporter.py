@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -102,6 +103,28 @@ def test_node_events_are_logged_by_severity(
     assert "(h/plane): " in record.getMessage()
     assert record.getMessage().startswith("node 0x")
     assert "no heartbeat for 352 ms" in record.getMessage()
+
+
+def test_what_happens_to_several_nodes_at_once_is_one_line_that_is_found_by_each_pad(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    stale, lost = NodeState.STALE, NodeState.ABSENT
+    silent = [
+        NodeEvent(
+            slot, rig.now_ns, NodeState.OPERATIONAL, stale, f"no sample for {20 + slot} ms, as from all"
+        )
+        for slot in (0, 1)
+    ]
+    rig.events = [*silent, NodeEvent(0, rig.now_ns, stale, lost, "no heartbeat for 352 ms")]
+    rig.poll()
+    both, one = [record for record in caplog.records if record.name == "handtouch.health"]
+    assert re.fullmatch(
+        r"2 nodes 0x.. \(h/plane\), 0x.. \(h/round\): "
+        "operational -> stale: no sample for 20 ms, as from all",
+        both.getMessage(),
+    )
+    assert both.__dict__["fields"] == {"hand": ["h"], "link": ["plane", "round"]}
+    assert one.getMessage().endswith("(h/plane): stale -> absent: no heartbeat for 352 ms")
 
 
 def test_a_longer_period_of_frames_is_published_before_the_next_frame_is_late(rig: Rig) -> None:

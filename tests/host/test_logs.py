@@ -183,6 +183,19 @@ def test_journald_sink_sends_records_with_fields(tmp_path: Path) -> None:
     assert (got["HANDTOUCH_HAND"], got["HANDTOUCH_LINK"]) == (b"left", b"thumb_tip")
 
 
+def test_a_record_about_several_pads_has_the_field_of_each(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
+        journal.bind(str(tmp_path / "journal"))
+        sender = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        sink = JournaldSink(sender, str(tmp_path / "journal"))
+        sink.write(record("stale", hand="left", link=["thumb_tip", "index_tip"]))
+        datagram = journal.recv(65536)
+        sink.close()
+    assert datagram.count(b"HANDTOUCH_LINK=") == 2
+    assert b"HANDTOUCH_LINK=thumb_tip\n" in datagram
+    assert b"HANDTOUCH_LINK=index_tip\n" in datagram
+
+
 @pytest.fixture
 def untouched() -> Iterator[None]:
     """Restore the loggers afterwards."""

@@ -57,6 +57,8 @@ _ENDPOINTS = {
     "inputs": INPUTS_ENDPOINT,
 }
 _BOOT_ALLOWANCE_S = 2.0
+_BUSY_SHARE = 0.01
+"""Least share of ticks that came late or never to be named; fewer change no figure of the verdict"""
 _SAMPLE_WINDOW_FRACTION = 0.95  # long, as the nodes share the interpreter
 _GIL_SWITCH_INTERVAL_S = 0.0005
 """Short, as hand, daemon and view share one interpreter, and the daemon must not wait for the view."""
@@ -146,6 +148,10 @@ def run(
     if not endless:
         score = score_contacts(collector.contacts, hand.truth)
         print(f"{score.table()}\n\n{score}" if details else score)
+        if (share := collector.late_share) > _BUSY_SHARE:
+            print(
+                f"this computer was too busy for {share:.0%} of the ticks;\n  a quieter one measures better"
+            )
     return 0 if collector.contact_count else 1
 
 
@@ -199,12 +205,14 @@ def _browser_view(daemon: HandtouchDaemon) -> Iterator[str]:
 
 
 class _ContactCollector:
-    """Display that counts contacts, keeps them for the score, and collects diagnoses."""
+    """Display that counts contacts and late ticks, keeps contacts for the score, and collects diagnoses."""
 
     def __init__(self, display: Display, keep: bool) -> None:
         self.contacts: list[wire.Contact] = []
         self.diagnoses: dict[tuple[str, str], str] = {}
         self.contact_count = 0
+        self.late_share = 0.0
+        """share of the periods so far whose tick came late or never"""
         self._display, self._keep_contacts = display, keep
 
     def show_message(self, message: wire.Message) -> None:
@@ -216,6 +224,8 @@ class _ContactCollector:
             for diagnosis in message.diagnoses:
                 text = f"{message.hand}/{message.link}: {diagnosis_text(diagnosis)}"
                 self.diagnoses.setdefault((message.link, diagnosis["kind"]), text)
+        if isinstance(message, wire.Service):
+            self.late_share = message.overruns / max(1, message.overruns + message.ticks)
         if not (isinstance(message, wire.Service) and isinstance(self._display, LineDisplay)):
             self._display.show_message(message)
 

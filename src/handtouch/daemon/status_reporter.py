@@ -48,6 +48,8 @@ _HEALTH_FIELDS, _SERVICE_FIELDS = (
     (names := [field.name for field in fields(kind)], attrgetter(*names))
     for kind in (wire.Health, wire.Service)
 )
+_MAX_NODES_NAMED = 3
+"""Nodes of one event that a line of the log names; of more the first and the last"""
 _WITHOUT_DIGITS = str.maketrans("", "", "0123456789")
 _BUS_LEVELS = {
     ErrorState.WARNING: logging.WARNING,
@@ -144,8 +146,7 @@ class StatusReporter:
         self._log_bus_transitions()
         events = self._master.drain_events()
         if events:
-            for event in events:
-                self._log_event(event)
+            self._log_events(events)
             self._update_node_states()
             if self.supervisor is not None:
                 changes = [event for event in events if not isinstance(event, ErrorChanged)]
@@ -214,19 +215,32 @@ class StatusReporter:
         hands = ", ".join(hand.name for hand in self._deployment.hands)
         return f"{hands}: {up} of {len(self._pads)} nodes up, {self._rates_hz.get('ticks', 0.0):.0f} ticks/s"
 
-    def _log_event(self, event: MasterEvent) -> None:
-        hand, link = self._names[event.slot]
-        node_id = self._pads[event.slot][1].node_id
-        level, state = logging.WARNING, "node replaced"
-        if isinstance(event, NodeEvent):
-            level = _event_level(event)
-            state = f"{event.new_state.name} {event.reason.translate(_WITHOUT_DIGITS)}"
-        elif isinstance(event, ErrorChanged):
-            cleared = event.emergency.cleared_ns is not None
-            level = logging.INFO if cleared else logging.WARNING
-            state = f"EMCY 0x{event.emergency.code:04X}{' cleared' if cleared else ''}"
-        extra = {"fields": {"hand": hand, "link": link}, "state": state}
-        _log.log(level, "node 0x%02X (%s/%s): %s", node_id, hand, link, event, extra=extra)
+    def _log_events(self, events: Iterable[MasterEvent]) -> None:
+        """Log events, in one line those of several nodes that differ in their numbers only."""
+        alike: dict[tuple[int, str, str], list[MasterEvent]] = {}
+        for event in events:
+            text = str(event).translate(_WITHOUT_DIGITS)
+            alike.setdefault((*_level_and_state(event), text), []).append(event)
+        for (level, state, _), group in alike.items():
+            names = [self._names[event.slot] for event in group]
+            pads = {
+                "hand": list(dict.fromkeys(hand for hand, _ in names)),
+                "link": [link for _, link in names],
+            }
+            nodes = [
+                f"0x{self._pads[event.slot][1].node_id:02X} ({hand}/{link})"
+                for event, (hand, link) in zip(group, names, strict=True)
+            ]
+            if len(nodes) > _MAX_NODES_NAMED:
+                nodes[1:-1] = ["..."]
+            _log.log(
+                level,
+                "%s %s: %s",
+                "node" if len(group) == 1 else f"{len(group)} nodes",
+                ", ".join(nodes),
+                group[0],
+                extra={"fields": pads, "state": state},
+            )
 
     def _log_rejected_adaptation(self) -> None:
         rejected = self._pipeline.tick.sheet_force.adaptation_rejected
@@ -436,6 +450,17 @@ class StatusReporter:
         return np.array(
             [self._pipeline.ticks, *(n for bus in counters for n in (bus.bits, bus.overflow))], dtype=np.int64
         )
+
+
+def _level_and_state(event: MasterEvent) -> tuple[int, str]:
+    """Return the level of an event in the log, and the state that limits how often it is logged."""
+    if isinstance(event, NodeEvent):
+        return _event_level(event), f"{event.new_state.name} {event.reason.translate(_WITHOUT_DIGITS)}"
+    if isinstance(event, ErrorChanged):
+        cleared = event.emergency.cleared_ns is not None
+        state = f"EMCY 0x{event.emergency.code:04X}{' cleared' if cleared else ''}"
+        return logging.INFO if cleared else logging.WARNING, state
+    return logging.WARNING, "node replaced"
 
 
 def _event_level(event: NodeEvent) -> int:

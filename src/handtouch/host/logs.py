@@ -209,7 +209,7 @@ class LineLogSink:
         """Write the whole record; it is lost if the reader has closed the file."""
         text = self._formatter.format(record)
         if self._with_fields:
-            text += "".join(f" {key}={value}" for key, value in _fields(record).items())
+            text += "".join(f" {key}={value}" for key, value in _fields(record))
             prefix = f"<{_SYSLOG_PRIORITY.get(record.levelno, 6)}>"
             text = "\n".join(prefix + line for line in text.split("\n"))
         data = f"{text}\n".encode(errors="backslashreplace")
@@ -234,18 +234,16 @@ class JournaldSink:
 
     def write(self, record: logging.LogRecord) -> None:
         """Send the record; write it as a line to stderr if the journal refuses it."""
-        values = {
-            "MESSAGE": self._formatter.format(record),
-            "PRIORITY": str(_SYSLOG_PRIORITY.get(record.levelno, 6)),
-            "SYSLOG_IDENTIFIER": "handtouch",
-            "LOGGER": record.name,
-            "THREAD_NAME": str(record.threadName),
-            **{f"HANDTOUCH_{key.upper()}": value for key, value in _fields(record).items()},
-        }
+        values = [
+            ("MESSAGE", self._formatter.format(record)),
+            ("PRIORITY", str(_SYSLOG_PRIORITY.get(record.levelno, 6))),
+            ("SYSLOG_IDENTIFIER", "handtouch"),
+            ("LOGGER", record.name),
+            ("THREAD_NAME", str(record.threadName)),
+            *((f"HANDTOUCH_{key.upper()}", value) for key, value in _fields(record)),
+        ]
         try:
-            self._socket.sendto(
-                b"".join(_encode_field(key, value) for key, value in values.items()), self._address
-            )
+            self._socket.sendto(b"".join(_encode_field(key, value) for key, value in values), self._address)
         except OSError:
             self._fallback.write(record)
 
@@ -267,16 +265,23 @@ def _cause(record: logging.LogRecord) -> Cause:
 
     The object is its fields, else its first argument unless that is a measured value.
     """
-    about = " ".join(_fields(record).values())
+    about = " ".join(value for _, value in _fields(record))
     if not about and isinstance(record.args, tuple) and record.args and not isinstance(record.args[0], float):
         about = str(record.args[0])
     return record.name, str(record.msg), about, str(getattr(record, "state", ""))
 
 
-def _fields(record: logging.LogRecord) -> dict[str, str]:
-    """Return the object of a message, given as `extra={"fields": {...}}`."""
+def _fields(record: logging.LogRecord) -> list[tuple[str, str]]:
+    """Return the object of a message, given as `extra={"fields": {...}}`; a list is a field for each value.
+
+    The journal finds a record by any of the values of a field.
+    """
     fields = getattr(record, "fields", {})
-    return {key: str(value) for key, value in fields.items()}
+    return [
+        (key, str(value))
+        for key, given in fields.items()
+        for value in (given if isinstance(given, list) else [given])
+    ]
 
 
 def is_journal(file: int, stream: str) -> bool:
