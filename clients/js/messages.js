@@ -80,7 +80,10 @@ export class Frame {
   /** The values of a link in a column: a number, or the elements of its row. */
   at(name, link) {
     const values = this[name];
-    if (!ArrayBuffer.isView(values)) throw new RangeError(`no column ${name} in this frame`);
+    if (!ArrayBuffer.isView(values)) {
+      const columns = Object.keys(this).filter((key) => ArrayBuffer.isView(this[key]));
+      throw new RangeError(`no column ${name} in this frame; its columns are ${columns.join(", ")}`);
+    }
     const size = values.length / this.links.length;
     const row = this.row(link);
     return size === 1 ? values[row] : values.subarray(row * size, (row + 1) * size);

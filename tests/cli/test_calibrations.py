@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -169,6 +171,20 @@ def test_damaged_store_is_reported_now_and_later(path: Path, capsys: pytest.Capt
     Store(path).close()
     assert run(path, "list") == 1
     assert f"{path}.damaged-" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_list_of_sensors_fits_the_terminal(
+    path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    assert run(path, "list") == 0
+    whole = capsys.readouterr().out.split()
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert run(path, "list") == 0
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert max(map(len, shown.splitlines()[1:])) <= width
+    assert sorted(shown.split()) == sorted(whole)
 
 
 def test_store_of_a_deployment_is_used(path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -91,6 +91,8 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         build_parser().parse_args(["--help"])
     listed = capsys.readouterr().out
     assert all(command in listed for command in COMMANDS)
+    assert main([]) == 2  # somebody who doesn't know a command yet
+    assert capsys.readouterr().err == listed
 
 
 def test_wrong_usage_exits_with_status_2() -> None:

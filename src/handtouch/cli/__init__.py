@@ -98,8 +98,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
+    given = sys.argv[1:] if arguments is None else arguments
+    parser = build_parser()
+    if not given:
+        parser.print_help(sys.stderr)
+        return 2
     try:
-        options = vars(build_parser().parse_args(arguments))
+        options = vars(parser.parse_args(given))
         command: Callable[..., int] = options.pop("command")
         if (kind := options.pop("endpoint_kind", None)) is not None:
             config = options.pop("daemon_config")

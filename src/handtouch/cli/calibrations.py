@@ -14,6 +14,7 @@ from handtouch.calibration import exchange
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, differences
 from handtouch.calibration.store import Store, StoreError, damaged_files, store_path
 from handtouch.cli.options import Subparsers, add_command, add_json, add_output, integer
+from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.host.json_output import print_json
 
 _APPLIED_NOTE = "a daemon that uses this store applies it within seconds; see `handtouch status`"
@@ -130,9 +131,16 @@ def run_list(store: Path | None, deployment: Path | None, as_json: bool) -> int:
             record = {"store": str(opened.path), "sensors": sensors, "damaged": [*map(str, damaged)]}
             print_json(record)
         else:
-            print(f"{opened.path}: {len(newest)} sensors")
+            print(f"{opened.path}: {len(newest)} sensor{'s' * (len(newest) != 1)}")
+            table = make_table(
+                "serial", "versions", "newest", "link", "content", right=("versions",), wrapped=("content",)
+            )
             for one in newest:
-                print(f"{one.serial:<10} {one.number:>4} x  {_summary_line(one)}")
+                link = f"{one.provenance.hand}/{one.provenance.link}"
+                table.add_row(
+                    str(one.serial), str(one.number), f"{one.written_utc[:16]}Z", link, _content_text(one)
+                )
+            print_table(output_console(), table)
         for path in damaged:
             print(f"{path}: a damaged store; delete it once its content isn't needed", file=sys.stderr)
         return 1 if damaged else 0
@@ -280,9 +288,16 @@ def _print_version(version: CalibrationVersion) -> None:
 
 def _summary_line(version: CalibrationVersion) -> str:
     origin = version.provenance
-    parts = [name for name in ("gains", "offsets", "law", "sheet") if getattr(version.calibration, name)]
     return (
         f"version {version.number:<4} {version.written_utc[:19]}Z  {origin.hand}/{origin.link:<18} "
+        f"{_content_text(version)}"
+    )
+
+
+def _content_text(version: CalibrationVersion) -> str:
+    origin = version.provenance
+    parts = [name for name in ("gains", "offsets", "law", "sheet") if getattr(version.calibration, name)]
+    return (
         f"{'+'.join(parts)}: {origin.method}, {origin.contacts} contacts"
         f"{'  FROM ANOTHER SENSOR' if origin.foreign else ''}{f'  ({origin.note})' if origin.note else ''}"
     )
