@@ -497,15 +497,19 @@ def _js_type(field: FieldDeclaration) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Write the files, or with --check name those that differ; return the exit status."""
-    stale = [path for path, text in wire_files().items() if not path.exists() or path.read_text() != text]
+    stale = {
+        path: text for path, text in wire_files().items() if not path.exists() or path.read_text() != text
+    }
+    for path, text in stale.items():
+        if "--check" in arguments:
+            name = path.relative_to(ROOT)
+            print(f"{name} differs from the declarations: run `make tables`", file=sys.stderr)
+        else:
+            path.write_text(text)
     if "--check" in arguments:
-        for path in stale:
-            print(
-                f"{path.relative_to(ROOT)} differs from the declarations: run `make tables`", file=sys.stderr
-            )
         return int(bool(stale))
-    for path, text in wire_files().items():
-        path.write_text(text)
+    if any(path.suffix == ".py" for path in stale):  # other files are made of these modules
+        return subprocess.run([sys.executable, "-m", "docs.wire_files"], cwd=ROOT, check=False).returncode
     return 0
 
 

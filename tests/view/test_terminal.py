@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from typing import Any
 
 import pytest
 from rich.console import Console
@@ -16,7 +15,18 @@ from handtouch.view.message_lines import diagnosis_text, message_line, position_
 from handtouch.view.terminal import HandView
 from handtouch.wire.health import Emergency
 
-PLACE: Any = {"normal": [0.0, 0.0, 1.0], "covariance_m2": [1e-8] * 9}
+
+def make_part(position_m: list[float], force_n: float | None, force_std_n: float | None) -> wire.ContactPart:
+    """Return one of two contacts on a pad."""
+    return {
+        "position_m": position_m,
+        "normal": [0.0, 0.0, 1.0],
+        "covariance_m2": [1e-8] * 9,
+        "force_n": force_n,
+        "force_std_n": force_std_n,
+    }
+
+
 CONTACT = wire.Contact(
     v=1,
     session=1,
@@ -206,8 +216,8 @@ def test_lines_in_a_terminal_keep_the_reason_of_a_pad(capsys: pytest.CaptureFixt
             replace(
                 CONTACT,
                 parts=(
-                    {"position_m": [0.001, 0.002, 0.003], **PLACE, "force_n": 1.5, "force_std_n": 0.25},
-                    {"position_m": [-0.01, 0.002, 0.003], **PLACE, "force_n": None, "force_std_n": None},
+                    make_part([0.001, 0.002, 0.003], 1.5, 0.25),
+                    make_part([-0.01, 0.002, 0.003], None, None),
                 ),
             ),
             "2 contacts: (1.00, 2.00, 3.00) mm 1.50 +- 0.25 N and (-10.00, 2.00, 3.00) mm",

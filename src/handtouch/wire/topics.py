@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from handtouch.wire.columns import Column, columns_of
 from handtouch.wire.contact import ACTION_REQUEST, PERCEPT_KINDS, Contact, Percept
@@ -22,8 +22,7 @@ from handtouch.wire.service import Service
 from handtouch.wire.status import MAX_SILENT_PERIODS
 
 
-@dataclass(frozen=True, slots=True)
-class EncodedMessage:
+class EncodedMessage(NamedTuple):
     """A message whose payload is encoded already; decode(encode(message)) returns its typed form."""
 
     topic: str
