@@ -1,7 +1,7 @@
 """Command line: `main` and the parser of all commands.
 
 A command's arguments, work and output are in one module, which is imported only when the command is used;
-`COMMANDS` lists the modules.
+`COMMANDS` lists the modules; entry points of the group `handtouch.commands` add others (docs/extend.md).
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import errno
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from handtouch import __version__
 from handtouch.cli.errors import failing
@@ -23,6 +24,9 @@ from handtouch.cli.options import (
     describe_command,
     find_endpoint,
 )
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 COMMANDS = {
     "demo": "run a simulated hand, the daemon and a live view together for half a minute; needs no hardware",
@@ -99,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
-    parser = build_parser()
+    parser = build_parser(own_only=bool(given) and given[0] in COMMANDS)
     if not given:
         parser.print_help(sys.stderr)
         return 2
@@ -121,6 +125,13 @@ def _run(arguments: Sequence[str] | None) -> int:
             sys.stdout.flush()  # while an error of it can be handled
 
 
+def _added_commands() -> Iterable[EntryPoint]:
+    """Return the entry points of commands that other packages add."""
+    from importlib.metadata import entry_points  # only here, so that handtouch's own commands start quickly
+
+    return entry_points(group="handtouch.commands")
+
+
 def _replace_what_cannot_be_encoded() -> None:
     """Show characters that a terminal or file can't encode as "?", instead of ending with an error."""
     for stream in (sys.stdout, sys.stderr):
@@ -133,8 +144,11 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands; the module of one is imported when that command is parsed."""
+def build_parser(*, own_only: bool = False) -> argparse.ArgumentParser:
+    """Return the parser of all commands; the module of one is imported when that command is parsed.
+
+    own_only: without those that other packages add, for which all installed packages are looked through.
+    """
     parser = SuggestingParser(
         prog="handtouch",
         epilog=EXIT_STATUS_HELP,
@@ -157,4 +171,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, text in COMMANDS.items():
         adder = f"requests:add_{name}" if name in REQUESTS else f"{name}:add_arguments"
         commands.add_parser(name, adder=f"handtouch.cli.{adder}", **describe_command(text))
+    for found in () if own_only else _added_commands():
+        text = f"from the package {found.dist.name}" if found.dist else "from another package"
+        commands.add_parser(found.name, adder=found.value, **describe_command(text))
     return parser

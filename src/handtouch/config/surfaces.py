@@ -1,4 +1,5 @@
-"""The `surface` table of a pad, one definition for each kind in the registry of `handtouch.field`.
+"""The `surface` table of a pad, one definition for each kind in the registry of `handtouch.field`, to which
+entry points of the group `handtouch.surfaces` add (docs/extend.md).
 
 Public names: `SurfaceTable`, `SURFACE_TABLES`, `PadSurface`, `surface_table`. Keys, ranges and descriptions
 are declared by the surface classes; nothing here names a shape.
@@ -15,6 +16,9 @@ from pydantic import Field, TypeAdapter, create_model
 from handtouch.config.base import Table
 from handtouch.field.surface import SURFACES, AnisotropicSurface, Surface
 from handtouch.field.surface_base import SurfaceKey, surface_keys
+from handtouch.host.plugins import load_plugins
+
+load_plugins("handtouch.surfaces", Surface)  # classes that name a kind register themselves
 
 
 class SurfaceTable(Table):

@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from handtouch import config
+from handtouch.host.plugins import load_plugins
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.pad_geometry import (
     SimulatedPrism,
@@ -23,10 +24,16 @@ from handtouch.simulate.pad_geometry import (
 
 
 def simulated_surface(surface: config.SurfaceTable) -> SimulatedSurface:
-    """Return the geometry of a pad's `surface` table."""
+    """Return the geometry of a pad's `surface` table. Raises ValueError for a kind without one."""
     if surface.kind in _OUTLINE_FORMS:
         return SimulatedOutline.from_table(surface, _OUTLINE_FORMS[surface.kind])
-    built = _BUILDERS[surface.kind](surface)
+    build = _BUILDERS.get(surface.kind) or load_plugins("handtouch.simulated_surfaces").get(surface.kind)
+    if build is None:
+        raise ValueError(
+            f'surface kind "{surface.kind}" has no simulated geometry; its package adds one by an entry '
+            f'point "{surface.kind}" of the group handtouch.simulated_surfaces (docs/extend.md)'
+        )
+    built: SimulatedSurface = build(surface)
     return replace(built, resistivity_ratio=surface.resistivity_ratio)
 
 
