@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -16,6 +16,14 @@ SOURCE = ROOT / "src"
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 HEAVY = {"core": ("can", "canopen", "zmq"), "canbus": ("scipy",), "wire": ("can", "canopen", "zmq", "scipy")}
 """Libraries that a package must not import."""
+
+RUN = (
+    "handtouch.cli.run",
+    "handtouch.daemon.metrics_server",
+    "handtouch.percept.child",
+    "handtouch.supervisor.child",
+)
+"""Modules that `handtouch run` and its processes start with."""
 
 Graph = dict[str, dict[str, int]]
 
@@ -107,6 +115,26 @@ def test_modules_import_each_other_in_no_cycle(graph: Graph) -> None:
         ).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
+
+
+def _reached(graph: Graph, roots: Iterable[str]) -> set[str]:
+    """Return the modules that these import, also later and in turn, with the packages that hold them."""
+    reached, waiting = set[str](), list(roots)
+    while waiting:
+        module = waiting.pop()
+        if module not in reached and module in FILES and module != "handtouch":
+            reached.add(module)
+            waiting += [*graph[module], module.rpartition(".")[0]]
+    return reached
+
+
+def test_the_daemon_and_its_processes_load_the_listed_packages_only(graph: Graph) -> None:
+    (block,) = re.findall(r"## What `handtouch run` loads.*?```text\n(.*?)```", PAGE, re.DOTALL)
+    reached = _reached(graph, RUN)
+    assert {_package(module) for module in reached} == set(block.split())
+    assert not {module for module in reached if _package(module) == "cli"} - {
+        f"handtouch.{name}" for name in ("cli", "cli.run", "cli.options", "cli.errors")
+    }
 
 
 @pytest.mark.parametrize("package", sorted(HEAVY))

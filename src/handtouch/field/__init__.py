@@ -1,5 +1,10 @@
 """Potential theory of one resistive touch sensor: arrays in, arrays out; no I/O, no clock."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from handtouch.field.contact_law import (
     ContactLaw,
     ForceEstimate,
@@ -7,14 +12,11 @@ from handtouch.field.contact_law import (
     contact_stack_resistance,
 )
 from handtouch.field.estimate import PointEstimate, estimate
-from handtouch.field.mesh_network import MeshNetwork, read_stl
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
 from handtouch.field.outline import Outline
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.rectangle import Location, Rectangle
-from handtouch.field.residual import PointTest, point_test, resolvable_separation
-from handtouch.field.sandwich import Sandwich, SandwichEstimate
 from handtouch.field.surface import (
     AnisotropicSurface,
     ConeSurface,
@@ -25,6 +27,11 @@ from handtouch.field.surface import (
     SphereSurface,
     Surface,
 )
+
+if TYPE_CHECKING:
+    from handtouch.field.mesh_network import MeshNetwork, read_stl
+    from handtouch.field.residual import PointTest, point_test, resolvable_separation
+    from handtouch.field.sandwich import Sandwich, SandwichEstimate
 
 __all__ = [
     "AnisotropicSurface",
@@ -57,3 +64,16 @@ __all__ = [
     "read_stl",
     "resolvable_separation",
 ]
+
+_LATER = {
+    **dict.fromkeys(("MeshNetwork", "read_stl"), "mesh_network"),
+    **dict.fromkeys(("PointTest", "point_test", "resolvable_separation"), "residual"),
+    **dict.fromkeys(("Sandwich", "SandwichEstimate"), "sandwich"),
+}
+"""Names that load their module when they are used: the daemon needs none of them"""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'handtouch.field' has no attribute {name!r}")
+    return getattr(import_module(f"handtouch.field.{_LATER[name]}"), name)
