@@ -14,6 +14,12 @@ before its onset. *An hour of chatter*: other hands of `default` at 200 Hz with 
 such grips, without bursts, slip at 10 mm/s and faster. *Percepts*: times that a published percept became
 `incipient` or `sliding`, without joint states; `incipient` has a lower threshold than the alarm.
 
+*More noise than is stated*: light grips at rest, 3.5 % ripple and 12 um of sway, with white noise added, and
+slips of 10 mm/s at 0.3, 1 and 3 N; the daemon has measured the noise on untouched pads before.
+
+*Light contacts whose force varies*: 0.15, 0.3 and 0.6 N, every two seconds to 15 % and back within a ramp;
+noise as stated.
+
 *Bound*: when ln of the likelihood ratio of a slip of known onset, speed and direction would reach the
 threshold in the mean (Lorden), with the test's own estimates of tremor and noise. *Threshold on the
 derivative*: all speeds at 0.5 and 2 N together, 200 Hz, world `ideal`, |dF/dt| / F; thresholds with at most
@@ -116,12 +122,20 @@ def run(
     seconds: float,
     from_s: float = 0.0,
     information_s: float = 0.0,
+    noise_ratio: float = 1.0,
 ) -> Record:
-    """Process grips, each one contact on its link's pad, from `from_s` of the scenario on."""
+    """Process grips, each one contact on its link's pad, from `from_s` of the scenario on.
+
+    `noise_ratio`: true noise of the channels over what the deployment states.
+    """
     deployment, period_ns = world.describe(DEPLOYMENT), round(1e9 / hz)
     hand = VirtualHand(deployment, Scenario.model_validate({"touch": grips}), world)
     times = from_s + np.arange(1, round(seconds * hz) + 1) / hz
     counts = np.stack([hand.counts(row, times) for row in range(len(hand.pads))], axis=1)
+    if noise_ratio > 1.0:
+        stated = np.array([deployment.nodes[pad.node].noise_counts for _, pad in deployment.pads])
+        more = np.sqrt(noise_ratio**2 - 1) * stated[:, None]
+        counts = np.rint(counts + np.random.default_rng(5).normal(size=counts.shape) * more)
     collector, model = PerceptCollector(), PadModel(deployment)
     pipeline = pipeline_of(deployment, collector, model=model, period_ns=period_ns)
     perceiving = PerceptPublisher(deployment, pipeline, collector, process=InlineProcess(deployment))
@@ -182,6 +196,10 @@ LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
 SMOOTH_S = (0.0, 0.01, 0.03)
 BURST_MM = 0.1
+NOISE_RATIOS, LIGHT_FORCES, SLIP_FORCES = (1.0, 1.5, 2.0, 3.0), (0.3, 0.6, 1.0), (0.3, 1.0, 3.0)
+RAMPS_S, RAMPED_FORCES = (0.05, 0.4), (0.15, 0.3, 0.6)
+UNTOUCHED_S = 90.0
+"""Time in which the noise is learned, before it matters"""
 HOLD_HANDS, HOLD_S, HOLD_SLIPS, FAST_MM_PER_S = (31, 32), 125.0, 4, 10.0
 """Hands of the reporting family in `default` for an hour of grips with chatter: length of the grips of each
 hand, and rounds of slips; speed from which the share found is stated."""
@@ -295,12 +313,12 @@ def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: Floa
     return rows
 
 
-def percept_alarms(firm: Record) -> int:
-    """Return how often a percept became `incipient` or `sliding`, from a second after the grip closed."""
+def percept_alarms(firm: Record, from_s: float = GRIPPED_S + 1.0, alarms: tuple[str, ...] = ALARMS) -> int:
+    """Return how often a percept became one of `alarms`, by default from a second after the grip closed."""
     count, alarmed = 0, set[str]()
     for percept in firm.percepts:
-        raised = percept.label in ALARMS
-        late = (percept.t_ns - 10**9) * 1e-9 > GRIPPED_S + 1.0
+        raised = percept.label in alarms
+        late = (percept.t_ns - 10**9) * 1e-9 > from_s
         count += raised and late and percept.link not in alarmed
         (alarmed.add if raised else alarmed.discard)(percept.link)
     return count
@@ -312,6 +330,82 @@ def false_alarms(firm: Record) -> tuple[Rate, int]:
     lasting = firm.t_s > GRIPPED_S + 1.0
     hours = rising.shape[1] * float(firm.t_s[-1] - GRIPPED_S - 1.0) / 3600
     return Rate(int(rising[lasting].sum()), hours), int(rising[~lasting].sum())
+
+
+def noisy(ratio: float, quick: bool) -> dict[str, Any]:
+    """Return false alarms of light grips, and slips of 10 mm/s found, with more noise than the file states.
+
+    The daemon sees the untouched pads for `UNTOUCHED_S` before.
+    """
+    world, still, found, slips = WORLDS["default"].draw(Family.REPORTING.seed(41)), dict[str, int](), 0, 0
+    seconds, rounds = (6.0, 1) if quick else (245.0, 4)
+    minutes, hz = len(PADS) * (seconds - 1.0) / 60, 200.0
+    grips = [
+        grip(k, UNTOUCHED_S, seconds, LIGHT_FORCES[k % 3], 700, ripple=0.035, sway_mm=0.012)
+        for k in range(len(PADS))
+    ]
+    held = run(grips, world, hz, UNTOUCHED_S + GRIPPED_S + seconds, noise_ratio=ratio)
+    begin_s = UNTOUCHED_S + GRIPPED_S + 1.0
+    for alarms in (ALARMS, ("sliding",)):
+        still[alarms[-1] if len(alarms) == 1 else "any"] = percept_alarms(held, begin_s, alarms)
+    delays = []
+    for repeat in range(rounds):
+        onset_s = UNTOUCHED_S + SLIPS_S
+        grips = [
+            grip(k, UNTOUCHED_S, RUN_S, SLIP_FORCES[k % 3], 900 + 100 * repeat, slip_from_s=onset_s)
+            for k in range(len(PADS))
+        ]
+        record = run(grips, world, hz, UNTOUCHED_S + RUN_S, noise_ratio=ratio)
+        for pad in range(len(PADS)):
+            ran = record.running[:, pad]
+            rising = record.t_s[ran & ~np.concatenate([[False], ran[:-1]])] - onset_s
+            after = rising[(rising > 0) & (rising <= LATEST_S)]
+            slips, found = slips + 1, found + bool(len(after))
+            delays += after[:1].tolist()
+    return {
+        "true noise over stated": ratio,
+        "contact minutes": minutes,
+        "false alarms a minute": Rate(still["any"], minutes),
+        "of them `sliding`": Rate(still["sliding"], minutes),
+        "10 mm/s found": Share(found, slips),
+        "median ms": 1e3 * float(np.median(delays)) if delays else math.nan,
+    }
+
+
+class RampedGrip(GripTouch):
+    """A grip whose force falls to 15 % and returns once in two seconds, each within `force_ramp_s`."""
+
+    force_ramp_s: float
+
+    def forces(self, times_s: FloatArray) -> FloatArray:
+        """Return forces (n,), as `GripTouch.forces`."""
+        phase = np.mod(times_s - self.from_s, 2.0)
+        down = np.clip(phase / self.force_ramp_s, 0.0, 1.0)
+        up = np.clip((phase - 1.0) / self.force_ramp_s, 0.0, 1.0)
+        return np.asarray(super().forces(times_s) * (1 - 0.85 * (down - up)))
+
+
+def ramped(force_ramp_s: float, quick: bool) -> dict[str, Any]:
+    """Return false alarms of light contacts at constant places whose force varies."""
+    world, seconds = WORLDS["default"].draw(Family.REPORTING.seed(42)), 6.0 if quick else 245.0
+    grips = []
+    for number, (link, size_mm) in enumerate(PADS):
+        force = RAMPED_FORCES[number % len(RAMPED_FORCES)]
+        settings = {"ripple": 0.035, "sway_mm": 0.012, "force_ramp_s": force_ramp_s, "seed": 1100 + number}
+        grips.append(
+            RampedGrip(
+                link=link, size_mm=size_mm, from_s=GRIPPED_S, duration_s=seconds + 1, path=((0.5, 0.5),),
+                force_n=(force,), roll_mm_per_n=0.0, **settings,
+            )
+        )  # fmt: skip
+    held = run(grips, world, 200.0, seconds)
+    minutes = len(PADS) * (seconds - GRIPPED_S - 1.0) / 60
+    return {
+        "ramps s": force_ramp_s,
+        "contact minutes": minutes,
+        "false alarms a minute": Rate(percept_alarms(held), minutes),
+        "of them `sliding`": Rate(percept_alarms(held, alarms=("sliding",)), minutes),
+    }
 
 
 def slip_score(made: Slips) -> EventScore:
@@ -407,6 +501,8 @@ def measure(report: Report) -> None:
         progress(worlds[-1])
     report.table("By world", worlds)
     report.table("An hour of chatter", [held_row])
+    report.table("More noise than is stated", [noisy(ratio, quick) for ratio in NOISE_RATIOS])
+    report.table("Light contacts whose force varies", [ramped(ramp_s, quick) for ramp_s in RAMPS_S])
     report.table("From onset to alarm", late)
     report.table("Against a threshold on the derivative of force", against)
     report.table("Cost", costs)

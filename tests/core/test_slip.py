@@ -196,6 +196,17 @@ def test_light_contact_may_begin_at_a_noisy_position() -> None:
         assert not contacts.step(k, noise_m * rng.standard_normal((8, 2)), noise_m=noise_m).any()
 
 
+@pytest.mark.parametrize("noise_m", [5e-5, 1.5e-4])
+def test_twice_the_noise_that_is_known_raises_few_alarms(noise_m: float) -> None:
+    """Without the limit in standard deviations it is one a second."""
+    rng, pads, steps, count = np.random.default_rng(9), 40, 600, 0
+    contacts = Contacts(pads)
+    for k in range(steps):
+        seen = 2.0 * noise_m * rng.standard_normal((pads, 2))
+        count += int(contacts.step(k, seen, 0.3, noise_m).sum()) * (k > 100)
+    assert count < 0.4 * pads * (steps - 100) * DT_S
+
+
 def test_information_of_a_slip_grows_with_its_age() -> None:
     contacts = Contacts(1)
     for k in range(61):

@@ -27,10 +27,14 @@ PADS = np.arange(3)
 class Contacts:
     """Contacts on the three pads of a model, solved one after the other."""
 
-    def __init__(self, model: PadModel, force_requested: bool = True) -> None:
+    def __init__(
+        self, model: PadModel, force_requested: bool = True, noise_squared: FloatArray | None = None
+    ) -> None:
         self._currents, self._values = np.zeros((3, 4)), np.full((3, VALUE_COUNT), np.nan)
         requested = np.full(3, force_requested)
-        self._solver = make_solver(model, self._currents, np.zeros(3), requested, self._values)
+        self._solver = make_solver(
+            model, self._currents, np.zeros(3), requested, self._values, noise_squared=noise_squared
+        )
 
     def solve(self, currents: FloatArray) -> None:
         """Solve contacts with these currents (3, 4) [A]."""
@@ -257,3 +261,16 @@ def test_contacts_on_a_pad_whose_electrodes_touch_are_located() -> None:
     np.testing.assert_allclose(values[0, VALUE_SLICES["xy"]], at, atol=1e-6)
     covariance = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)
     assert 0 < np.trace(covariance) < 1e-6
+
+
+@pytest.mark.parametrize("ratio", [0.5, 3.0])
+def test_the_noise_of_positions_is_the_measured_one_where_it_exceeds_the_stated(
+    bench: Any, ratio: float
+) -> None:
+    measured = np.square(ratio * bench.model.noise_counts)[:, None] * np.ones(4)
+    stated, noisy = Contacts(bench.model), Contacts(bench.model, noise_squared=measured)
+    currents = np.array([bench.counts(pad, 0.4, 0.6, 1e-3) for pad in PADS]) * bench.model.ampere_per_count
+    for contacts in (stated, noisy):
+        contacts.solve(currents)
+    factor = max(ratio, 1.0) ** 2
+    assert noisy.pad_noise_m2 == pytest.approx(factor * stated.pad_noise_m2, rel=1e-9)

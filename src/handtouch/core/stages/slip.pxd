@@ -3,7 +3,7 @@ from libc cimport math
 
 cdef Py_ssize_t _PERIOD, _LOG_THRESHOLD, _STRIDE, _CREEP_START, _LEVEL_DRIFT, _TREMOR_START, _TREMOR_MIN
 cdef Py_ssize_t _TREMOR_MAX, _TREMOR_RATE, _TREMOR_TIME, _CREEP_TIME, _COUPLING, _COUPLING_DRIFT
-cdef Py_ssize_t _CHATTER, _CHATTER_SPEED, _CHATTER_TIME, _SWAY, _START, _LAST
+cdef Py_ssize_t _CHATTER, _CHATTER_SPEED, _CHATTER_TIME, _SWAY, _START, _START_NOISE, _LAST, _LAST_NOISE
 cdef Py_ssize_t _ONSETS, _RECENT, _OLDER_STRIDE, _RAMP, _SCORE, _INFORMATION
 cdef Py_ssize_t _LABEL, _LOG_ODDS, _SLIPPING, _SLIPS, _SAMPLES, _AGE
 cdef Py_ssize_t _POSITION, _VELOCITY, _VAR_PP, _VAR_PV, _VAR_VV
@@ -17,7 +17,7 @@ cdef double _NO_SLIP, _INFINITY, _MIN_VARIANCE_M2, _FIRM_CURRENT_FACTOR, _START_
 cdef double _ACCELERATION_DENSITY, _FORCE_RATE_TIME_S, _LIFT_OFF_HORIZON_S, _SLIP_RATE_HZ, _UNLOADING_FACTOR
 cdef double _ODDS_DECAY_S, _MIN_REST_S, _MAX_REST_SPEED, _START_LEVEL_VARIANCE, _PRESS_NOISE_GAIN
 cdef double _MIN_LEARNING_S, _DECREASE_FACTOR, _MIN_LOG_CREEP, _MAX_LOG_CREEP, _MAX_SQUARED_INNOVATION
-cdef double _MIN_ONSET_LOG_ODDS, _SLOW, _MEDIUM, _FAST
+cdef double _MIN_ONSET_LOG_ODDS, _NOISE_SIGMA, _SLOW, _MEDIUM, _FAST
 
 cdef class SlipStage:
     cdef double[::1] parameters, work, state, values, total_a
@@ -41,6 +41,8 @@ cdef void _start_test(SlipStage stage, Py_ssize_t row, bint kept) noexcept
 cdef void _track_motion(SlipStage stage, Py_ssize_t row, double force) noexcept
 @cython.locals(s='double[::1]', axis=Py_ssize_t)
 cdef void _test_slip(SlipStage stage, Py_ssize_t row) noexcept
+@cython.locals(s='double[::1]')
+cdef void _keep_last(SlipStage stage, Py_ssize_t row) noexcept
 cdef void _set_transition(SlipStage stage) noexcept
 @cython.locals(s='double[::1]', p='double[::1]', first=Py_ssize_t, c=Py_ssize_t)
 cdef void _filter_axis(SlipStage stage, Py_ssize_t row, Py_ssize_t axis) noexcept
@@ -56,7 +58,7 @@ cdef void _learn_creep(SlipStage stage, Py_ssize_t row, Py_ssize_t axis) noexcep
 @cython.locals(s='double[::1]', work='double[::1]', k=Py_ssize_t, best=Py_ssize_t, axis=Py_ssize_t,
                ramps=Py_ssize_t, slow=Py_ssize_t, medium=Py_ssize_t, fast=Py_ssize_t)
 cdef void _sum_ratios(SlipStage stage, Py_ssize_t row) noexcept
-@cython.locals(s='double[::1]', p='double[::1]', limit=double, x=double, y=double)
+@cython.locals(s='double[::1]', p='double[::1]', limit=double, noise=double, x=double, y=double)
 cdef bint _is_far(SlipStage stage, Py_ssize_t row, Py_ssize_t k, Py_ssize_t j) noexcept
 @cython.locals(ages=Py_ssize_t, since_s=double, j=Py_ssize_t)
 cdef bint _has_left(SlipStage stage, Py_ssize_t row, Py_ssize_t k) noexcept

@@ -45,8 +45,8 @@ _ONSETS, _RECENT, _OLDER_STRIDE = (
     12,
     4,
 )  # onset hypotheses; the latest of them; every fourth of older ones
-_RAMP = 7 * _ONSETS  # of an axis: four states, and these
-_SCORE, _INFORMATION, _START = 4 * _ONSETS, 5 * _ONSETS, 6 * _ONSETS
+_RAMP = 8 * _ONSETS  # of an axis: four states, and these
+_SCORE, _INFORMATION, _START, _START_NOISE = 4 * _ONSETS, 5 * _ONSETS, 6 * _ONSETS, 7 * _ONSETS
 
 # a pad's row of the state
 _LABEL, _LOG_ODDS, _SLIPPING, _SLIPS, _SAMPLES, _AGE = 0, 1, 2, 3, 4, 5
@@ -61,7 +61,8 @@ _RAMPS = _AGES + _ONSETS
 _CREEP = _RAMPS + 2 * _RAMP
 _GRIP_CREEP = _CREEP + 2 * _ONSETS
 _LAST = _GRIP_CREEP + 2 * _ONSETS
-_COUNT = _LAST + 2
+_LAST_NOISE = _LAST + 2
+_COUNT = _LAST_NOISE + 1
 SLIP_COUNT = _COUNT
 SLIP_WORK = 7 * _ONSETS
 SLIP_SLICES = {
@@ -115,6 +116,7 @@ _MIN_LEARNING_S = 0.3
 _DECREASE_FACTOR = 0.8  # decreases of the creep are learnt more slowly: tremor comes in bursts
 _MIN_LOG_CREEP, _MAX_LOG_CREEP = 2.0 * math.log(20e-6), 0.0  # ln of a variance [m^2/s^2]
 _MAX_SQUARED_INNOVATION = 6.0  # of an innovation squared: slip must not be learnt as tremor
+_NOISE_SIGMA = 3.0  # of the difference of two positions: 1 in 370; from 2 on, one more sample of delay
 _MIN_ONSET_LOG_ODDS = 3.0  # ln R above which onset and velocity are computed
 # variances of the prior of each velocity component
 _SLOW, _MEDIUM, _FAST = 1e-3 * 1e-3, 5e-3 * 5e-3, 30e-3 * 30e-3
@@ -244,7 +246,7 @@ def _start_test(stage: SlipStage, row: int, kept: bool) -> None:
     if not kept:
         s[row + _PRESS_NOISE] = s[row + _LEARNING] = 0.0
     s[row + _FIRST_PRESS] = s[row + _LAST_PRESS] = s[row + _BEFORE_PRESS] = stage.press
-    s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
+    _keep_last(stage, row)
     s[row + _TESTED] = s[row + _UNTIL_ONSET] = s[row + _ONSET_NUMBER] = s[row + _ONSET_AGE] = 0.0
     s[row + _LOG_RATIO] = stage.alarm_ratio = _NO_SLIP
 
@@ -292,7 +294,14 @@ def _test_slip(stage: SlipStage, row: int) -> None:
         _advance_ramps(stage, row, row + _RAMPS + axis * _RAMP)
         _learn_creep(stage, row, axis)
     _sum_ratios(stage, row)
+    _keep_last(stage, row)
+
+
+def _keep_last(stage: SlipStage, row: int) -> None:
+    """Keep the position of this sample, and the larger variance of its noise."""
+    s = stage.state
     s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
+    s[row + _LAST_NOISE] = max(stage.noise_x, stage.noise_y)
 
 
 def _set_transition(stage: SlipStage) -> None:
@@ -362,6 +371,7 @@ def _advance_onsets(stage: SlipStage, row: int) -> None:
         for k in range(6):
             s[row + _RAMPS + axis * _RAMP + k * _ONSETS] = 0.0
         s[row + _RAMPS + axis * _RAMP + _START] = s[row + _LAST + axis]
+    s[row + _RAMPS + _START_NOISE] = s[row + _LAST_NOISE]
 
 
 def _shift_onsets(stage: SlipStage, row: int, first: int, stop: int) -> None:
@@ -369,7 +379,7 @@ def _shift_onsets(stage: SlipStage, row: int, first: int, stop: int) -> None:
     s = stage.state
     for k in range(stop - first):
         s[row + _AGES + stop - 1 - k] = s[row + _AGES + stop - 2 - k]
-    for block in range(14):
+    for block in range(2 * _RAMP // _ONSETS):
         slots = row + _RAMPS + block * _ONSETS
         for k in range(stop - first):
             s[slots + stop - 1 - k] = s[slots + stop - 2 - k]
@@ -452,12 +462,14 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
 
 
 def _is_far(stage: SlipStage, row: int, k: int, j: int) -> bool:
-    """Return whether the contact is farther from its position at onset j than chatter moves it since k."""
+    """Return whether the contact is farther from its position at onset j than chatter moves it since k, by
+    more than noise does."""
     s, p = stage.state, stage.parameters
     limit = min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * s[row + _AGES + k])
+    noise = max(stage.noise_x, stage.noise_y) + s[row + _RAMPS + _START_NOISE + j]
     x = stage.x - s[row + _RAMPS + _START + j]
     y = stage.y - s[row + _RAMPS + _RAMP + _START + j]
-    return x * x + y * y > limit * limit
+    return x * x + y * y > limit * limit + _NOISE_SIGMA * _NOISE_SIGMA * noise
 
 
 def _has_left(stage: SlipStage, row: int, k: int) -> bool:

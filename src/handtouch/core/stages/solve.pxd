@@ -63,7 +63,8 @@ cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t 
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
-@cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, values='double[::1]')
+@cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, values='double[::1]', noise=double,
+               scale=double, measured2=double)
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, fit=locate.Fit, values='double[::1]', law=force.PadLaw)
 cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) noexcept

@@ -462,11 +462,14 @@ def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> N
 
 
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
-    """Write the covariance of the arc lengths from channel noise alone."""
+    """Write the covariance of the arc lengths from channel noise alone: the larger of stated and measured."""
     n, values, row = solver.fit.whitening.electrodes, solver.values, pad * _COUNT
     first, xx, xy, yy = pad * solver.electrodes, 0.0, 0.0, 0.0
     for i in range(n):
-        noise = 1.0 / solver.weight[first + i]
+        noise, scale = 1.0 / solver.weight[first + i], solver.ampere_per_count[first + i]
+        measured2 = solver.noise_squared[first + i] * scale * scale
+        if measured2 > noise * noise:
+            noise = math.sqrt(measured2)
         x, y = solver.by_x[i] * noise, solver.by_y[i] * noise
         xx += x * x
         xy += x * y
