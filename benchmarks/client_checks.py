@@ -77,7 +77,7 @@ class Truth:
         if not scenario.repeat:
             raise ValueError("the scenario must repeat")
         self._start_ns, self._duration_s = start_ns, scenario.duration_s
-        self.links = sorted({link for link, _ in scenario.touch_links})
+        self.links = sorted(set(scenario.touch_links))
         self.deaths_ns: list[int] = []
         self._shown = {link: _shown(scenario, link) for link in self.links}
 

@@ -18,8 +18,6 @@ from scipy.sparse.linalg import SuperLU, splu
 from handtouch.config import Deployment, parse
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.daemon.table_cache import build_pad_model
-from handtouch.field import Rectangle
-from handtouch.simulate.current_crowding import crowding, solve_disc
 from tests.deployments import deployment_text, pad_text
 
 FloatArray = NDArray[np.float64]
@@ -100,18 +98,3 @@ def test_a_contact_over_the_edge_is_nearer_to_the_middle_of_its_part_on_the_pad_
     middle_mm = points[points > 0].mean()
     found_mm, without_mm = located_mm(currents_a)[0][0], located_mm(currents_a, False)[0][0]
     assert abs(found_mm - middle_mm) < abs(without_mm - middle_mm)
-
-
-@pytest.mark.parametrize(("distance_mm", "force_n"), [(3.0, 1.0), (3.0, 4.0), (4.0, 4.0), (6.0, 8.0)])
-def test_the_simulated_shift_is_that_of_the_solved_sheet(distance_mm: float, force_n: float) -> None:
-    currents_a = solved_currents(distance_mm, 12.0, force_n)
-    found_mm, _ = located_mm(currents_a, crowded=False)
-    pressure_kpa = 1e3 * force_n / (np.pi * RADIUS_MM**2)
-    x = RADIUS_MM * np.sqrt(OHM / LAYER_OHM_MM2 * (pressure_kpa / 100.0) ** ALPHA)
-    beside = np.log(
-        Rectangle(LENGTH_MM, WIDTH_MM).conformal_radius(distance_mm + np.array([-1e-4, 1e-4]), 12.0)
-    )
-    nearness = RADIUS_MM * float(beside[1] - beside[0]) / 2e-4
-    shift_mm = RADIUS_MM * float(solve_disc(np.array([x]), nearness)[0])
-    assert distance_mm - found_mm[0] == pytest.approx(shift_mm, rel=0.15, abs=0.004)
-    np.testing.assert_allclose(RADIUS_MM * crowding(np.array([x]), np.array([nearness])), shift_mm, rtol=0.02)

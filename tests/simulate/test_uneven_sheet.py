@@ -12,8 +12,8 @@ from scipy.special import k0
 
 from handtouch import config
 from handtouch.field import ElectrodeNetwork
+from handtouch.field.contact_law import contact_stack_resistance
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, unevenness_slopes
-from handtouch.simulate.pad_circuit import contact_layer_ohm
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.sheet_solver import TABLE_NODES, ElectrodeGaps, solve_sheet
 from handtouch.simulate.surfaces import simulated_surface
@@ -158,15 +158,10 @@ def test_counts_of_an_uneven_pad_follow_its_local_resistance(deployment: config.
     maps = uneven_sheet_maps(shape, ElectrodeGaps(*(4 * ((gap, gap),))), unevenness)
     local_ohm = sheet.ohm_per_square * float(unevenness.ohm_ratio(np.array([0.3, 0.4])))
     radius_m = 1e-3 * sheet.contact_radius_mm
-    layer_ohm = contact_layer_ohm(
-        np.full(1, 3.0),
-        np.full(1, radius_m),
-        local_ohm,
-        1e-6 * sheet.contact_ohm_mm2,
-        1e3 * sheet.reference_kpa,
-        sheet.alpha,
-    )[0]
+    contact_ohm_m2 = 1e-6 * sheet.contact_ohm_mm2
+    contact_ohm_m2 *= (1e3 * sheet.reference_kpa * math.pi * radius_m**2 / 3.0) ** sheet.alpha
     nearest = np.abs(TABLE_NODES - 0.3).argmin(), np.abs(TABLE_NODES - 0.4).argmin()
-    spread_ohm = local_ohm / (2 * math.pi) * (maps.table[4][nearest] - math.log(radius_m))
-    expected = node.drive_v / (layer_ohm + spread_ohm) / (1e-3 * node.full_scale_ma) * 32767
+    outer_m = math.exp(maps.table[4][nearest])
+    ohm = contact_stack_resistance(local_ohm, contact_ohm_m2, radius_m, outer_m)
+    expected = node.drive_v / ohm / (1e-3 * node.full_scale_ma) * 32767
     assert counts.sum() == pytest.approx(expected, rel=0.01)

@@ -28,6 +28,7 @@ from handtouch.simulate.worlds import (
     LogNormal,
     LogUniform,
     Normal,
+    OneOf,
     ShearSpread,
     Uniform,
     World,
@@ -94,6 +95,9 @@ DRAWS: dict[str, Draw] = {
     "mounts.joint_delay_s": lambda drawn, _: drawn.joints("right", 3).delay_s,
     "contacts.radius_sigma": radius_sigma,
     "contacts.elongation": lambda drawn, deployment: drawn.contact(deployment.sheets["s"], 5).elongation,
+    "contacts.profile": lambda drawn, deployment: drawn.world.contacts.profile.names.index(
+        drawn.contact(deployment.sheets["s"], 5).profile
+    ),
     "sheets.contact_ohm_ratio": pad_value("contact_ohm_ratio"),
     "sheets.alpha_offset": pad_value("alpha_offset"),
     "sheets.parameter_ratio": lambda drawn, _: drawn.sheet_factors("right/round"),
@@ -133,7 +137,14 @@ def assert_moments(values: FloatArray, expected: Distribution, sigmas: float = 4
 
 @pytest.mark.parametrize(
     "distribution",
-    [Fixed(2.0), Uniform(-1.0, 3.0), Normal(1.0, 2.0), LogNormal(2.0, 0.3), LogUniform(1.0, 3.0)],
+    [
+        Fixed(2.0),
+        Uniform(-1.0, 3.0),
+        Normal(1.0, 2.0),
+        LogNormal(2.0, 0.3),
+        LogUniform(1.0, 3.0),
+        OneOf(("a", "b", "c")),
+    ],
     ids=str,
 )
 def test_samples_have_the_moments_of_their_distribution(distribution: Distribution) -> None:
@@ -219,6 +230,9 @@ def test_harsh_is_two_to_three_times_as_wide_as_default() -> None:
     default, harsh = distributions(WORLDS["default"]), distributions(WORLDS["harsh"])
     for name, distribution in default.items():
         wide = harsh[name]
+        if isinstance(distribution, OneOf):
+            assert set(wide.names) >= set(distribution.names)
+            continue
         if isinstance(distribution, Fixed):  # noise, delay and rates
             ratio = wide.mean / distribution.mean if distribution.value not in (0, 1) else 2.5
         else:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.problems import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
-from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.contact_patch import ContactPatch, discs
 from handtouch.simulate.gripper_objects import (
     GRIPPER_OBJECTS,
     CurvedEdge,
@@ -170,9 +170,13 @@ class GripperStimulus:
         return cls(GripperWorld(1e-3 * index.radius_mm), thumb, index)
 
     @property
-    def touch_links(self) -> Sequence[tuple[str, float | None]]:
+    def touch_links(self) -> Sequence[str]:
         """One touch per finger."""
-        return [(link, None) for link in FINGER_LINKS.values()]
+        return list(FINGER_LINKS.values())
+
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
+        """Return the world's patch."""
+        return drawn
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the contacts at `t_s`, or the present ones if `t_s` is past."""
@@ -238,7 +242,7 @@ class LivePadStimulus:
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return one contact without force."""
         n = len(times_s)
-        return np.full((1, 2, n), 0.5), np.zeros((1, n)), np.tile([[1.0], [0.0], [0.0]], (1, 1, n))
+        return np.full((1, 2, n), 0.5), np.zeros((1, n)), discs(np.ones((1, n)))
 
     def tangential_n(self, times_s: FloatArray) -> FloatArray:
         """Return no force."""

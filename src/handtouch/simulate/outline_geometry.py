@@ -211,6 +211,21 @@ class SimulatedOutline(SimulatedSurface):
         slopes = np.moveaxis(self.drawing(position)[1], 2, 0) * self.stretch_at(position)[:, None, None]
         return np.asarray(np.linalg.solve(slopes, vector_m.T[:, :, None])[:, :, 0].T)
 
+    def fractions_beside(self, position: FloatArray, vector_m: FloatArray) -> FloatArray:
+        """Return fractions of the pad (k, 2, n) at vectors (k, 2, n) [m] from positions (2, k).
+
+        They are those of the drawing, which is a conformal image of the surface, in metres on the latter.
+        """
+        count = vector_m.shape[2]
+        start = np.repeat(position, count, axis=1)
+        vector = vector_m.transpose(1, 0, 2).reshape(2, -1)
+        target = self.drawing(start)[0] + vector / self.stretch_at(start)
+        found = start + self.fractions_of(start, vector)
+        for _ in range(2):
+            miss = target - self.drawing(found)[0]
+            found = found + self.fractions_of(found, miss * self.stretch_at(found))
+        return np.asarray(found.reshape(2, -1, count).transpose(1, 0, 2))
+
     def project(self, points_m: FloatArray) -> SurfaceProjection:
         """Project points (n, 3) in the pad's frame."""
         x, y, z = points_m.T

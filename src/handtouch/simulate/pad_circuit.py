@@ -1,11 +1,11 @@
 """Circuit of one pad: its four currents at many times, from contacts, faults and wiring.
 
-Public names: `PadCircuit` (sheet, contacts and wiring), `contact_layer_ohm`, `layer_ratio`.
+Public names: `PadCircuit` (sheet, contacts and wiring), `layer_of`.
 
 The contacts k of a pad share its sheet: V = J_k R_k + sum_l (G_kl + phi_k . Z phi_l) J_l + phi_k . v0, where
-R_k is the resistance of a contact with the sheet around it (paper eqs. 9-11), G Green's function between
-contacts, Z and v0 `impedance_ohm` and `idle_v` of `SheetCircuit`. All times with the same set of contacts are
-solved together.
+R_k is the resistance of a contact with the sheet around it, of grounded electrodes, and phi_k the mean shares
+of its current (`solve_patches`); G is Green's function between contacts, Z and v0 `impedance_ohm` and
+`idle_v` of `SheetCircuit`. All times with the same set of contacts are solved together.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import i0e, i1e
 
 from handtouch import config
-from handtouch.simulate.contact_patch import effective_patch, look_up_patches
-from handtouch.simulate.current_crowding import shifted_positions
+from handtouch.simulate.contact_patch import discs
 from handtouch.simulate.faults import Fault, FaultContacts
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.outline_solver import outline_mutual_resistance
@@ -35,41 +33,20 @@ from handtouch.simulate.sheet_solver import (
     SheetMaps,
     mutual_resistance,
 )
+from handtouch.simulate.solved_contact import ContactLayer, PatchNodes, look_up_nodes, solve_patches
 from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.torn_sheet import cut_sheet_maps, is_beyond_cut
 from handtouch.simulate.unevenness import Unevenness
 
 FloatArray = NDArray[np.float64]
-_MIN_FORCE_N = 1e-6  # avoids a division by 0
 _MAX_BATCHED_TIMES = 20
 _UNIFORM_DISC_RESISTANCE = 0.25
 """Resistance of a disc with uniform current density, besides ln(R / a), in rho / 2 pi."""
 
 
-def contact_layer_ohm(
-    force_n: FloatArray,
-    radius_m: FloatArray,
-    sheet_ohm: FloatArray | float,
-    contact_ohm_m2: FloatArray | float,
-    reference_pa: FloatArray | float,
-    alpha: FloatArray | float,
-) -> FloatArray:
-    """Return a disc's resistance [ohm], of layer and sheet under it: eq. 11's first term times rho / 2 pi."""
-    x = layer_ratio(force_n, radius_m, sheet_ohm, contact_ohm_m2, reference_pa, alpha)
-    return np.asarray(sheet_ohm / (2 * math.pi) * i0e(x) / (x * i1e(x)))  # the scaling cancels
-
-
-def layer_ratio(
-    force_n: FloatArray,
-    radius_m: FloatArray,
-    sheet_ohm: FloatArray | float,
-    contact_ohm_m2: FloatArray | float,
-    reference_pa: FloatArray | float,
-    alpha: FloatArray | float,
-) -> FloatArray:
-    """Return x of eq. 11: a disc's radius times the root of the sheet's resistance over the layer's."""
-    pressure = np.maximum(force_n, _MIN_FORCE_N) / (math.pi * radius_m**2)
-    return np.asarray(radius_m * np.sqrt(sheet_ohm / contact_ohm_m2 * (pressure / reference_pa) ** alpha))
+def layer_of(sheet: config.Sheet) -> ContactLayer:
+    """Return the layer of a sheet's contacts."""
+    return ContactLayer(1e-6 * sheet.contact_ohm_mm2, 1e3 * sheet.reference_kpa, sheet.alpha)
 
 
 @dataclass(frozen=True)
@@ -78,16 +55,18 @@ class _ContactSeries:
 
     position: FloatArray
     """(2, n), fractions of the pad."""
-    radius_m: FloatArray
-    """(n,), of the equivalent disc."""
-    focus: FloatArray
-    """(2, n), of its patch, in fractions of the pad; 0: a disc."""
-    contact_ohm: FloatArray
-    """(n,), of the contact itself, without the sheet around it; infinite without contact."""
+    patch: FloatArray
+    """(PATCH_ROWS, n), see `ContactPatch`."""
     is_static: bool
-    """True if its position never changes."""
-    layer: FloatArray | None = None
-    """(n,), `layer_ratio` of a pressed contact, whose current is the sheet's and the layer's together."""
+    """True if position and patch never change."""
+    force_n: FloatArray
+    """(n,), that which the layer conducts as; 0 without contact."""
+    leak_ohm: FloatArray | None = None
+    """(n,), of a leak through the layer instead, infinite without."""
+
+    @property
+    def is_touching(self) -> NDArray[np.bool_]:
+        return self.force_n > 0 if self.leak_ohm is None else np.isfinite(self.leak_ohm)
 
 
 @dataclass(frozen=True)
@@ -186,7 +165,7 @@ class PadCircuit:
         currents = np.repeat(circuit.idle_a[None], len(times_s), axis=0)
         if not contacts:
             return currents
-        touching = np.array([np.isfinite(contact.contact_ohm) for contact in contacts])
+        touching = np.array([contact.is_touching for contact in contacts])
         patterns, pattern_of = np.unique(touching, axis=1, return_inverse=True)
         for number, pattern in enumerate(patterns.T):
             if pattern.any():
@@ -213,17 +192,8 @@ class PadCircuit:
         rows: NDArray[np.intp],
     ) -> FloatArray:
         """Return the currents (n, m) that contacts cause in the amplifiers at the times `rows`."""
-        shares, own = [], []
-        for contact in contacts:
-            at = rows[:1] if contact.is_static else rows
-            sheet = np.zeros(len(at), np.intp)
-            values, slopes = look_up_patches(bank, sheet, contact.position[:, at], contact.focus[:, at])
-            if contact.layer is not None:
-                values[:-1] = self._crowded_shares(bank, contact, at, slopes[-1])
-            shares.append(np.broadcast_to(values[:-1].T, (len(rows), len(values) - 1)))
-            spreading = np.maximum(values[-1] - np.log(contact.radius_m[rows]), 0.0)
-            local_ohm = self._local_ohm(contact.position[:, rows])
-            own.append(contact.contact_ohm[rows] + local_ohm / (2 * math.pi) * spreading)
+        solved = [self._solve_alone(bank, contact, rows) for contact in contacts]
+        shares, own = zip(*solved, strict=True)
         phi = np.stack(shares, axis=1)  # (n, k, m)
         ohm = phi @ circuit.impedance_ohm @ phi.transpose(0, 2, 1)
         number = np.arange(len(contacts))
@@ -234,16 +204,27 @@ class PadCircuit:
         current = volt / ohm[:, 0] if len(contacts) == 1 else np.linalg.solve(ohm, volt[:, :, None])[:, :, 0]
         return np.asarray(np.einsum("nk,nki->ni", current, phi) @ circuit.share_to_channel.T)
 
-    def _crowded_shares(
-        self, bank: SheetMapBank, contact: _ContactSeries, at: NDArray[np.intp], slope: FloatArray
-    ) -> FloatArray:
-        """Return the electrodes' shares of a contact's current at its centre; `slope` (2, k) of ln R."""
-        assert contact.layer is not None
-        centre = shifted_positions(
-            self.shape, contact.position[:, at], slope, contact.radius_m[at], contact.layer[at]
+    def _solve_alone(
+        self, bank: SheetMapBank, contact: _ContactSeries, rows: NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean shares (n, m), and resistances (n,) [ohm] to grounded electrodes, at times `rows`."""
+        at = rows[:1] if contact.is_static else rows
+        columns = np.concatenate([contact.position[:, at], contact.patch[:, at]])
+        columns, number = np.unique(columns, axis=1, return_inverse=True)
+        number = np.broadcast_to(number.ravel(), len(rows))
+        position, sheet = columns[:2], np.zeros(columns.shape[1], np.intp)
+        if contact.leak_ohm is not None:
+            values, _ = bank.look_up(sheet, *position)
+            spreading = np.maximum(values[-1] - np.log(columns[2]), 0.0) + _UNIFORM_DISC_RESISTANCE
+            spreading_ohm = self._local_ohm(position) / (2 * math.pi) * spreading
+            return values[:-1].T[number], contact.leak_ohm[rows] + spreading_ohm[number]
+        nodes = PatchNodes.of_patches(self.shape, position, columns[2:])
+        log_radius, shares, _ = look_up_nodes(bank, sheet, nodes)
+        local_ohm = np.broadcast_to(self._local_ohm(position), len(sheet))[number]
+        ohm, mean, _ = solve_patches(
+            nodes, log_radius, shares, number, contact.force_n[rows], local_ohm, layer_of(self.sheet)
         )
-        values, _ = look_up_patches(bank, np.zeros(len(at), np.intp), centre, contact.focus[:, at])
-        return values[:-1]
+        return mean, ohm
 
     def _new_wiring(self) -> Wiring:
         return Wiring(self.series_ohm.copy(), self.drive_v, self.limit_a)
@@ -256,17 +237,15 @@ class PadCircuit:
             assert isinstance(self.gaps, ElectrodeGaps)
             green = mutual_resistance(self.shape, self.gaps)
         mutual = np.zeros((len(rows), len(contacts), len(contacts)))
-        moving: list[tuple[int, int, float]] = []
+        moving: list[tuple[int, int, FloatArray]] = []
         for i, one in enumerate(contacts):
             for j, other in enumerate(contacts[:i]):
-                nearest_m = max(one.radius_m[rows[0]], other.radius_m[rows[0]])
+                nearest_m = np.maximum(one.patch[0, rows], other.patch[0, rows])
                 if one.is_static and other.is_static:
                     positions = (*one.position[:, 0].tolist(), *other.position[:, 0].tolist())
-                    mutual[:, [i, j], [j, i]] = green.static_resistance_ohm(*positions, float(nearest_m))
+                    mutual[:, [i, j], [j, i]] = green.static_resistance_ohm(*positions, float(nearest_m[0]))
                 elif len(rows) > _MAX_BATCHED_TIMES:
-                    ohm = green.resistance_ohm(
-                        one.position[:, rows], other.position[:, rows], np.full(len(rows), nearest_m)
-                    )
+                    ohm = green.resistance_ohm(one.position[:, rows], other.position[:, rows], nearest_m)
                     mutual[:, [i, j], [j, i]] = ohm[:, None]
                 else:
                     moving.append((i, j, nearest_m))
@@ -274,7 +253,7 @@ class PadCircuit:
             first, second = [i for i, _, _ in moving], [j for _, j, _ in moving]
             one_at = np.concatenate([contacts[i].position[:, rows] for i in first], axis=1)
             other_at = np.concatenate([contacts[j].position[:, rows] for j in second], axis=1)
-            limits_m = np.repeat([nearest_m for _, _, nearest_m in moving], len(rows))
+            limits_m = np.concatenate([nearest_m for _, _, nearest_m in moving])
             ohm = green.resistance_ohm(one_at, other_at, limits_m).reshape(len(moving), -1).T
             mutual[:, first, second] = mutual[:, second, first] = ohm
         return mutual
@@ -284,7 +263,7 @@ class PadCircuit:
     ) -> list[_ContactSeries]:
         position, force, patches = touches.contacts(times_s)
         contacts = [
-            self._pressed_contact(position[lane], patches[lane], force[lane] * force_ratio, False)
+            _ContactSeries(position[lane], patches[lane], False, force[lane] * force_ratio)
             for lane in range(len(force))
             if force[lane].any()
         ]
@@ -294,47 +273,23 @@ class PadCircuit:
                 contacts += self._fault_contacts(added, len(times_s), force_ratio)
         return contacts
 
-    def _fault_contacts(self, discs: FaultContacts, n: int, force_ratio: FloatArray) -> list[_ContactSeries]:
+    @staticmethod
+    def _fault_contacts(added: FaultContacts, n: int, force_ratio: FloatArray) -> list[_ContactSeries]:
         contacts = []
-        disc_ohm = self.sheet.ohm_per_square * _UNIFORM_DISC_RESISTANCE / (2 * math.pi)
-        for position, radius_m in zip(discs.position, discs.radius_m, strict=True):
-            positions, focus = np.repeat(position[:, None], n, axis=1), np.zeros((2, n))
-            radii = np.full(n, radius_m)
-            if discs.force_n is not None and discs.force_n.any():
-                contacts.append(
-                    self._pressed_contact(
-                        positions, np.stack([radii, *focus]), discs.force_n * force_ratio, True
-                    )
-                )
-            elif discs.conductance_s is not None and discs.conductance_s.any():
+        for position, radius_m in zip(added.position, added.radius_m, strict=True):
+            where = np.repeat(position[:, None], n, axis=1), discs(np.full(n, radius_m)), True
+            if added.force_n is not None and added.force_n.any():
+                contacts.append(_ContactSeries(*where, added.force_n * force_ratio))
+            elif added.conductance_s is not None and added.conductance_s.any():
                 with np.errstate(divide="ignore", over="ignore"):
-                    leak_ohm = len(discs.position) / discs.conductance_s
-                contacts.append(_ContactSeries(positions, radii, focus, leak_ohm + disc_ohm, True))
+                    leak_ohm = len(added.position) / added.conductance_s
+                contacts.append(_ContactSeries(*where, np.zeros(n), leak_ohm))
         return contacts
-
-    def _pressed_contact(
-        self, position: FloatArray, patch: FloatArray, force_n: FloatArray, is_static: bool
-    ) -> _ContactSeries:
-        radius_m, (equivalent_m, focus) = patch[0], self.patch_on_sheet(position, patch)
-        sheet, own = self.sheet, np.full(len(force_n), np.inf)
-        law = 1e-6 * sheet.contact_ohm_mm2, 1e3 * sheet.reference_kpa, sheet.alpha
-        on = force_n > 0
-        own[on] = contact_layer_ohm(force_n[on], radius_m[on], self._local_ohm(position[:, on]), *law)
-        layer = layer_ratio(force_n, radius_m, self._local_ohm(position), *law) if sheet.crowding else None
-        is_static = is_static and (layer is None or np.ptp(layer) == 0.0)
-        return _ContactSeries(position, equivalent_m, focus, own, is_static, layer)
 
     def _local_ohm(self, position: FloatArray) -> FloatArray | float:
         """Return the sheet resistance at positions (2, n): (n,), or () on an even sheet."""
         nominal = self.sheet.ohm_per_square
         return nominal if self.unevenness.is_even else nominal * self.unevenness.ohm_ratio(position)
-
-    def patch_on_sheet(self, position: FloatArray, patch: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return equivalent radii (n,) [m], and foci (2, n) as fractions, of patches (3, n) [m]."""
-        radius_m, focus_m = effective_patch(patch[0], patch[1:], self.shape.stretch)
-        if not focus_m.any():
-            return radius_m, focus_m
-        return radius_m, self.shape.fractions_of(position, focus_m)
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -348,5 +303,5 @@ def _changes_circuit(fault: Fault) -> bool:
 
 
 def _remove_where(contact: _ContactSeries, mask: NDArray[np.bool_]) -> _ContactSeries:
-    contact_ohm = np.where(mask, np.inf, contact.contact_ohm)
-    return dataclasses.replace(contact, contact_ohm=contact_ohm)
+    leak_ohm = None if contact.leak_ohm is None else np.where(mask, np.inf, contact.leak_ohm)
+    return dataclasses.replace(contact, force_n=np.where(mask, 0.0, contact.force_n), leak_ohm=leak_ohm)

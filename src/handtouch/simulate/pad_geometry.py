@@ -141,6 +141,21 @@ class SimulatedSurface(SheetMetric):
         across_m = self.arc * self.radius(position[0] * self.length_m)
         return vector_m / np.stack([np.full_like(across_m, self.length_m), across_m])
 
+    def fractions_beside(self, position: FloatArray, vector_m: FloatArray) -> FloatArray:
+        """Return fractions of the pad (k, 2, n) at vectors (k, 2, n) [m] from positions (2, k).
+
+        The vectors are those of the plane that touches the conformal image of the surface, of its scale at
+        the position: a disc there is one in which every potential has its mean in the centre.
+        """
+        found = self.fractions_of(np.repeat(position, vector_m.shape[2], axis=1), _flat(vector_m))
+        step = 1e-3 * self.length_m
+        s_m = position[0] * self.length_m
+        wider = np.log(self.radius(s_m + step) / self.radius(s_m - step)) / (2 * step)
+        along = vector_m[:, 0] * (1 + wider[:, None] * vector_m[:, 0] / 2)
+        beside = position.T[:, :, None] + found.reshape(2, *vector_m[:, 0].shape).transpose(1, 0, 2)
+        beside[:, 0] = position[0][:, None] + along / self.length_m
+        return beside
+
     def side_units(self) -> tuple[float, float, float, float]:
         """Return metres along the sides x0, xa, y0, yb per unit of the coordinate along them."""
         near, far = self.radius([0.0, self.length_m]).tolist()
@@ -205,6 +220,11 @@ class SimulatedSurface(SheetMetric):
         tilt = self._profile_angle(self.length_m / 2)
         cos, sin = math.cos(tilt), math.sin(tilt)
         return np.array([cos * axial + sin * outward, aside, cos * outward - sin * axial])
+
+
+def _flat(vector: FloatArray) -> FloatArray:
+    """Return vectors (k, 2, n) as (2, k n)."""
+    return np.asarray(vector.transpose(1, 0, 2).reshape(2, -1))
 
 
 @dataclass(frozen=True)

@@ -93,15 +93,19 @@ class Scenario(Table):
         return max(touch.until_s for touch in self.touches) + self.pause_s
 
     @property
-    def touch_links(self) -> list[tuple[str, float | None]]:
-        """Link of each touch, and its radius [m] where the touch defines one."""
-        return [(t.link, None if t.radius_mm is None else 1e-3 * t.radius_mm) for t in self.touches]
+    def touch_links(self) -> list[str]:
+        """Link of each touch."""
+        return [touch.link for touch in self.touches]
+
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:
+        """Return the patch of a touch; `drawn`: the world's, where the touch doesn't define its own."""
+        return self.touches[number].patch(drawn)
 
     def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> ScheduledTouches:
-        """Return the touches of one pad; `patch(number)` is for touches that define no radius."""
+        """Return the touches of one pad; `patch(number)`: the world's, as in `touch_patch`."""
         return ScheduledTouches(
             [
-                (touch, ContactPatch(1e-3 * touch.radius_mm) if touch.radius_mm else patch(number))
+                (touch, touch.patch(patch(number)))
                 for number, touch in enumerate(self.touches)
                 if touch.link == link
             ]

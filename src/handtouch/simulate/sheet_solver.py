@@ -203,6 +203,19 @@ class SheetMapBank:
         by_phi = np.einsum("kmi,ki->mk", across[..., 1], of_s)
         return values, np.stack([by_s, by_phi], axis=1)
 
+    def look_up_anywhere(
+        self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return `look_up` of positions on the whole pad: beyond the maps' ends, shares and the conformal
+        radius itself continue as straight lines, the latter down to 1e-3 of its value there."""
+        values, slopes = self.look_up(sheet, s, phi)
+        position = np.stack([s, phi])
+        beyond = position - np.clip(position, EDGE_INSET_FRACTION, 1 - EDGE_INSET_FRACTION)
+        change = (slopes * beyond).sum(axis=1)
+        values[:-1] += change[:-1]
+        values[-1] += np.log(np.maximum(1 + change[-1], 1e-3))
+        return values, slopes
+
 
 class _SheetSolver:
     """Solutions on one sheet.

@@ -66,9 +66,9 @@ class PadStimulus(Protocol):
         """Times [s]: to sample the force at; after which the sheet settles; at which touches begin."""
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and patches (k, 3, n) [m].
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and patches.
 
-        k is `max_contacts`, n the number of times. A patch is the radius and focus of a `ContactPatch`.
+        k is `max_contacts`, n the number of times. patches: (k, PATCH_ROWS, n), see `ContactPatch.column`.
         """
 
     def tangential_n(self, times_s: FloatArray) -> FloatArray:
@@ -91,14 +91,17 @@ class Stimulus(Protocol):
         """Duration of one pass."""
 
     @property
-    def touch_links(self) -> Sequence[tuple[str, float | None]]:
-        """Link of each touch, and its radius [m] where the touch defines one."""
+    def touch_links(self) -> Sequence[str]:
+        """Link of each touch."""
+
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:
+        """Return the patch of a touch; `drawn`: the world's, where the touch doesn't define its own."""
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the contacts of all pads at `t_s`."""
 
     def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> PadStimulus:
-        """Return the contacts of one pad; `patch(number)` is for touches that define no radius."""
+        """Return the contacts of one pad; `patch(number)`: the world's, as in `touch_patch`."""
 
     def joint_trajectory(self, robot: RobotDescription) -> JointTrajectory | None:
         """Return the joint motion of a hand; None if its joints don't move."""

@@ -10,7 +10,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from pydantic import Field
 
 from handtouch.config.base import Table
 from handtouch.config.tables import Name, Positive
-from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.contact_patch import ContactPatch, Profile, discs
 from handtouch.simulate.smoothstep import smoothstep, smoothstep_array
 
 FloatArray = NDArray[np.float64]
@@ -47,7 +47,29 @@ class ScenarioTouch(Table):
     ramp_s: Positive = Field(
         0.15, description="time in which the force rises from 0, and falls to 0 at the end"
     )
-    radius_mm: Positive | None = Field(None, description="contact radius; left out: that of the sheet")
+    radius_mm: Positive | None = Field(
+        None, description="contact radius, of a round, even patch unless stated; left out: the world's patch"
+    )
+    profile: Profile | None = Field(
+        None, description="how the pressure is distributed over the patch; left out: the world's"
+    )
+    elongation: Annotated[float, Field(ge=1, le=5)] | None = Field(
+        None, description="length over width of the patch, of the same area; left out: the world's"
+    )
+    direction_deg: float | None = Field(
+        None,
+        description="from x on the pad to the patch's length and rise of pressure; left out: the world's",
+    )
+
+    def patch(self, drawn: ContactPatch) -> ContactPatch:
+        """Return the touch's patch; `drawn`: the world's, for what it leaves out."""
+        made = drawn if self.radius_mm is None else ContactPatch(1e-3 * self.radius_mm)
+        stated: dict[str, Any] = {
+            "profile": self.profile,
+            "elongation": self.elongation,
+            "direction_rad": None if self.direction_deg is None else math.radians(self.direction_deg),
+        }
+        return made._replace(**{key: value for key, value in stated.items() if value is not None})
 
     @property
     def until_s(self) -> float:
@@ -163,12 +185,12 @@ class ScheduledTouches:
         return np.concatenate([np.zeros(0), *force_times]), np.array(settling), begins
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and patches (k, 3, n) [m]."""
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, patches (k, PATCH_ROWS, n)."""
         order = np.argsort(times_s, kind="stable")
         ordered = times_s[order]
         k, n = len(self._lanes), len(times_s)
         position, force = np.full((k, 2, n), 0.5), np.zeros((k, n))
-        patches = np.tile([[1.0], [0.0], [0.0]], (k, 1, n))
+        patches = discs(np.ones((k, n)))
         for row, (lane, spans_s) in enumerate(zip(self._lanes, self._spans_s, strict=True)):
             first, last = np.searchsorted(ordered, spans_s)
             for number in np.flatnonzero(first < last).tolist():
@@ -176,9 +198,7 @@ class ScheduledTouches:
                 during = order[first[number] : last[number]]
                 position[row][:, during] = touch.positions(times_s[during])
                 force[row, during] = touch.forces(times_s[during])
-                patches[row][:, during] = np.outer(
-                    [patch.radius_m, *patch.focus_m], patch.growth(force[row, during])
-                )
+                patches[row][:, during] = patch.column(force[row, during])
         return position, force, patches
 
     def tangential_n(self, times_s: FloatArray) -> FloatArray:

@@ -2,10 +2,10 @@
 
 Public name: `VirtualHand`. It has neither clock nor state: the same time gives the same sample.
 
-A contact obeys V = J [R_contact + R_sheet + sum_i phi_i R_i m_i], where J is its current, phi the shares of
-`SheetMaps`, R_i the resistors and m = (1 + G R / rho)^-1 phi the shares that the electrodes collect through
-them. The contact is a disc with the resistance of eqs. 9-11 of the paper, its outer radius the conformal one;
-the shares are those of its centre, exact by the mean-value property if the disc lies on the sheet.
+A contact obeys V = J [R_contact + sum_i phi_i R_i m_i], where J is its current, R_contact the resistance of
+its layer and the sheet to grounded electrodes, phi the mean shares of its current, R_i the resistors and
+m = (1 + G R / rho)^-1 phi the shares that the electrodes collect through them. R_contact and phi are those of
+`solve_patches`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch import config
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
-from handtouch.simulate.contact_patch import ContactPatch, look_up_patches
-from handtouch.simulate.current_crowding import shift_table, shifted_positions
+from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault
-from handtouch.simulate.pad_circuit import contact_layer_ohm, layer_ratio
+from handtouch.simulate.pad_circuit import layer_of
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import SheetMapBank
+from handtouch.simulate.solved_contact import ContactLayer, PatchNodes, look_up_nodes, solve_patches
 from handtouch.simulate.stimulus import AppliedContact, Stimulus
 from handtouch.simulate.truth import GroundTruth, Vector
 from handtouch.simulate.virtual_pad import VirtualPad
@@ -63,8 +63,6 @@ class VirtualHand:
         self.virtual_pads = [
             VirtualPad.build(deployment, hand, pad, stimulus, world, all_faults) for hand, pad in self.pads
         ]
-        if any(pad.circuit.sheet.crowding for pad in self.virtual_pads):
-            shift_table()  # not while samples are due
         self._shear_rows = [(k, pad.shear) for k, pad in enumerate(self.virtual_pads) if pad.shear]
         self._bank = SheetMapBank([row.circuit.maps for row in self.virtual_pads])
         self._circuits = _HealthyCircuits(self.virtual_pads)
@@ -86,11 +84,11 @@ class VirtualHand:
         ]
         self._touch_pads = [
             [
-                (number, ContactPatch(radius_m) if radius_m else world.contact(row.sheet, index).patch)
+                (number, stimulus.touch_patch(index, world.contact(row.sheet, index).patch))
                 for number, row in enumerate(self.virtual_pads)
                 if row.pad.link == link
             ]
-            for index, (link, radius_m) in enumerate(stimulus.touch_links)
+            for index, link in enumerate(stimulus.touch_links)
         ]
 
     def sample(self, t_s: float) -> NDArray[np.int64]:
@@ -179,7 +177,7 @@ class VirtualHand:
 
     def _contacts_at(self, t_s: float) -> list[_PadContact]:
         return [
-            _PadContact(row, contact, _applied_patch(contact, patch))
+            _PadContact(row, contact, ContactPatch(contact.radius_m) if contact.radius_m else patch)
             for contact in self._stimulus.contacts_at(t_s)
             for row, patch in self._touch_pads[contact.touch_number]
         ]
@@ -188,7 +186,7 @@ class VirtualHand:
         """Return currents (k, c) [A], and derivatives (k, c, 3) by x, y [fractions] and total current."""
         rows = np.array([contact.row for contact in contacts])
         position = np.array([(contact.contact.x, contact.contact.y) for contact in contacts]).T
-        patch = np.array([(contact.patch.radius_m, *contact.patch.focus_m) for contact in contacts]).T
+        patch = np.stack([contact.column for contact in contacts], axis=1)
         force = np.array([contact.contact.force_n for contact in contacts])
         times_s = np.array([t_s])
         pads = [self.virtual_pads[contact.row] for contact in contacts]
@@ -200,66 +198,40 @@ class VirtualHand:
     ) -> tuple[FloatArray, FloatArray]:
         """Return currents (k, c) [A] of contacts (k,), each alone on its pad, at the nominal supply voltage.
 
-        rows: (k,) of the pads. position: (2, k), fractions of the pad. patch: (3, k), radius and focus of a
-        `ContactPatch` [m]. force: (k,), apparent [N]. Second: the currents' derivatives (k, c, 3) by x, y
+        rows: (k,) of the pads. position: (2, k), fractions of the pad. patch: (PATCH_ROWS, k), see
+        `ContactPatch.column`. force: (k,), apparent [N]. Second: the currents' derivatives (k, c, 3) by x, y
         [fractions] and total current.
         """
-        pads = [self.virtual_pads[row] for row in rows.tolist()]
-        equivalent_m, focus = self._patches_on_sheets(pads, position, patch)
-        log_ratio = look_up_patches(self._bank, rows, position, focus)[0][-1] - np.log(equivalent_m)
-        values, slopes = self._look_up_centres(rows, position, patch[0], force, equivalent_m, focus)
-        shares = values[:-1].T
-        collected, total = self._circuits.solve_contacts(rows, position, shares, log_ratio, force, patch[0])
-        by_position = self._circuits.share_to_channel[rows] @ slopes[:-1].transpose(2, 0, 1)
+        if not len(rows):
+            channels = self._circuits.share_to_channel.shape[1]
+            return np.zeros((0, channels)), np.zeros((0, channels, 3))
+        groups = [np.flatnonzero(rows == row) for row in np.unique(rows)]
+        parts = [
+            PatchNodes.of_patches(self.virtual_pads[rows[at[0]]].shape, position[:, at], patch[:, at])
+            for at in groups
+        ]
+        nodes = PatchNodes.joined(parts).taken(np.argsort(np.concatenate(groups)))
+        log_radius, shares, slopes = look_up_nodes(self._bank, rows, nodes)
+        sheet_ohm, layer = self._circuits.sheets(rows, position)
+        number = np.arange(len(rows))
+        ohm, mean, by_node = solve_patches(nodes, log_radius, shares, number, force, sheet_ohm, layer)
+        collected, total = self._circuits.solve_contacts(rows, mean, ohm)
+        by_position = self._circuits.share_to_channel[rows] @ np.einsum("makn,kn->kma", slopes, by_node)
         jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
         return total[:, None] * collected, jacobian
-
-    def _look_up_centres(
-        self,
-        rows: NDArray[np.intp],
-        position: FloatArray,
-        radius_m: FloatArray,
-        force: FloatArray,
-        equivalent_m: FloatArray,
-        focus: FloatArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return `look_up_patches` at the centres of the contacts' currents."""
-        values, slopes = look_up_patches(self._bank, rows, position, focus)
-        circuits = [self.virtual_pads[row].circuit for row in rows.tolist()]
-        if not any(circuit.sheet.crowding for circuit in circuits):
-            return values, slopes
-        layer = self._circuits.layer_ratio(rows, position, force, radius_m)
-        centre = position.copy()
-        for k, circuit in enumerate(circuits):
-            if circuit.sheet.crowding:
-                at = slice(k, k + 1)
-                centre[:, at] = shifted_positions(
-                    circuit.shape, position[:, at], slopes[-1][:, at], equivalent_m[at], layer[at]
-                )
-        return look_up_patches(self._bank, rows, centre, focus)
-
-    @staticmethod
-    def _patches_on_sheets(
-        pads: Sequence[VirtualPad], position: FloatArray, patch: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return equivalent radii (k,) [m], and foci (2, k) as fractions, of patches (3, k) [m]."""
-        if not patch[1:].any():
-            return patch[0], np.zeros_like(position)
-        found = [
-            pad.circuit.patch_on_sheet(position[:, [number]], patch[:, [number]])
-            for number, pad in enumerate(pads)
-        ]
-        return np.concatenate([radius for radius, _ in found]), np.hstack([focus for _, focus in found])
 
     def _truth(
         self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int, t_s: float
     ) -> GroundTruth:
         row, applied = self.virtual_pads[contact.row], contact.contact
         shape = row.shape
-        s_m, phi = applied.x * shape.length_m, applied.y * shape.arc
+        at = np.array([[applied.x], [applied.y]])
+        nodes = PatchNodes.of_patches(shape, at, contact.column[:, None])
+        x, y = nodes.centres(shape, at)[:, 0].tolist()
+        s_m, phi = x * shape.length_m, y * shape.arc
         point, normal = shape.point(s_m, phi), shape.normal(s_m, phi)
         in_counts = jacobian * self._gains[contact.row][:, None]
-        in_counts[:, :2] @= np.linalg.inv(shape.metres_per_fraction(applied.x, applied.y))
+        in_counts[:, :2] @= np.linalg.inv(shape.metres_per_fraction(x, y))
         variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
         covariance = variance * np.linalg.inv(in_counts.T @ in_counts)
         return GroundTruth(
@@ -271,7 +243,7 @@ class VirtualHand:
             _vector(row.rotation @ point + row.translation),
             _vector(row.rotation @ normal),
             applied.force_n,
-            contact.patch.radius_m,
+            contact.patch.radius_under(applied.force_n),
             tuple(currents[: len(row.limits)].tolist()),
             min(math.sqrt(covariance[0, 0] + covariance[1, 1]), _guess_error_m(shape)),
             self._true_force_vector(row, normal, applied.force_n, t_s),
@@ -295,15 +267,16 @@ def _guess_error_m(shape: SimulatedSurface) -> float:
     return math.hypot(shape.length_m, width_m) / math.sqrt(12)
 
 
-def _applied_patch(contact: AppliedContact, patch: ContactPatch) -> ContactPatch:
-    return ContactPatch(contact.radius_m) if contact.radius_m else patch.under(contact.force_n)
-
-
 @dataclass(frozen=True)
 class _PadContact:
     row: int
     contact: AppliedContact
     patch: ContactPatch
+
+    @property
+    def column(self) -> FloatArray:
+        """The patch (PATCH_ROWS,) under its force."""
+        return self.patch.column(np.array([self.contact.force_n]))[:, 0]
 
 
 class _HealthyCircuits:
@@ -312,9 +285,7 @@ class _HealthyCircuits:
     def __init__(self, rows: Sequence[VirtualPad]) -> None:
         self._drive_v = np.array([row.circuit.drive_v for row in rows])
         self._sheet_ohm = np.array([row.sheet.ohm_per_square for row in rows])
-        self._alpha = np.array([row.sheet.alpha for row in rows])
-        self._reference_pa = np.array([row.sheet.reference_kpa * 1e3 for row in rows])
-        self._contact_ohm_m2 = np.array([row.sheet.contact_ohm_mm2 * 1e-6 for row in rows])
+        self._layers = np.array([layer_of(row.sheet) for row in rows]).T
         circuits = [row.circuit.healthy for row in rows]
         self._impedance_ohm = _padded([circuit.impedance_ohm for circuit in circuits])
         self.share_to_channel = _padded([circuit.share_to_channel for circuit in circuits])
@@ -323,41 +294,20 @@ class _HealthyCircuits:
         self._is_even = all(unevenness.is_even for unevenness in self._unevenness)
 
     def solve_contacts(
-        self,
-        rows: NDArray[np.intp],
-        position: FloatArray,
-        shares: FloatArray,
-        log_ratio: FloatArray,
-        force_n: FloatArray,
-        radius_m: FloatArray,
+        self, rows: NDArray[np.intp], shares: FloatArray, ohm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the shares (k, c) of the channels in each contact's current, and these currents (k,) [A].
 
-        log_ratio: (k,), logarithm of the conformal radius over that of the equivalent disc. radius_m: (k,),
-        of the disc of the same area.
+        shares: (k, c), of grounded electrodes. ohm: (k,), resistance to these.
         """
         column = shares[:, :, None]
         collected = (self.share_to_channel[rows] @ column)[:, :, 0]
-        sheet_ohm = self._sheet_ohm[rows] * self._ohm_ratio(rows, position)
-        ohm = contact_layer_ohm(
-            force_n,
-            radius_m,
-            sheet_ohm,
-            self._contact_ohm_m2[rows],
-            self._reference_pa[rows],
-            self._alpha[rows],
-        )
-        ohm += sheet_ohm / (2 * math.pi) * np.maximum(log_ratio, 0.0)
-        ohm += (column.transpose(0, 2, 1) @ self._impedance_ohm[rows] @ column)[:, 0, 0]
+        ohm = ohm + (column.transpose(0, 2, 1) @ self._impedance_ohm[rows] @ column)[:, 0, 0]
         return collected, self._drive_v[rows] / ohm
 
-    def layer_ratio(
-        self, rows: NDArray[np.intp], position: FloatArray, force_n: FloatArray, radius_m: FloatArray
-    ) -> FloatArray:
-        """Return `pad_circuit.layer_ratio` of contacts (k,)."""
-        sheet_ohm = self._sheet_ohm[rows] * self._ohm_ratio(rows, position)
-        law = self._contact_ohm_m2[rows], self._reference_pa[rows], self._alpha[rows]
-        return layer_ratio(force_n, radius_m, sheet_ohm, *law)
+    def sheets(self, rows: NDArray[np.intp], position: FloatArray) -> tuple[FloatArray, ContactLayer]:
+        """Return the sheet resistances (k,) at contacts, and their layers."""
+        return self._sheet_ohm[rows] * self._ohm_ratio(rows, position), ContactLayer(*self._layers[:, rows])
 
     def _ohm_ratio(self, rows: NDArray[np.intp], position: FloatArray) -> FloatArray:
         """Return the local over the nominal sheet resistance (k,) at positions (2, k)."""

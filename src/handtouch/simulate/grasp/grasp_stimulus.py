@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
-from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.contact_patch import ContactPatch, discs
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
@@ -112,9 +112,13 @@ class GraspStimulus:
         return len(self.patches.total_n) * TIME_STEP_S
 
     @property
-    def touch_links(self) -> list[tuple[str, float | None]]:
+    def touch_links(self) -> list[str]:
         """Link of each touch; radii come with the contacts."""
-        return [(link, None) for link in self.pads for _ in range(self.max_contacts)]
+        return [link for link in self.pads for _ in range(self.max_contacts)]
+
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
+        """Return the world's patch."""
+        return drawn
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the discs at `t_s`."""
@@ -191,14 +195,13 @@ class _GraspPadStimulus:
         return _times_s(sampled), _times_s(settling), _times_s(begins)
 
     def contacts(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and discs (k, 3, n) [m]."""
+        """Return positions (k, 2, n), forces (k, n) [N], 0 without contact, and discs (k, PATCH_ROWS, n)."""
         patches, lanes = self.stimulus.patches, np.arange(self.max_contacts)
         steps = self.stimulus.step_indices(times_s)
         force = patches.force_n[steps, self.row][:, lanes].T * (steps >= 0)
         position = patches.position[steps, self.row][:, lanes].transpose(1, 2, 0)
         radius = np.asarray(patches.radius_m[steps, self.row][:, lanes].T)
-        discs = np.stack([radius, np.zeros_like(radius), np.zeros_like(radius)], axis=1)
-        return np.asarray(position), np.asarray(force), discs
+        return np.asarray(position), np.asarray(force), discs(radius)
 
     def tangential_n(self, times_s: FloatArray) -> FloatArray:
         """Return the tangential force (2, n) along x and y of the pad [N]."""

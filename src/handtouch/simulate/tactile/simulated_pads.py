@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.contact_patch import discs as evenly_pressed
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
 from handtouch.simulate.grasp.patches import pad_discs, project_points
 from handtouch.simulate.stimulus import AppliedContact
@@ -102,7 +103,7 @@ class SimulatedPads:
         force_n = discs.force_n * self._force_ratio(t_s, discs)
         _, inverse, number = np.unique(discs.key, return_inverse=True, return_counts=True)
         alone = number[inverse] == 1
-        patch = np.stack([discs.radius_m[alone], *np.zeros((2, alone.sum()))])
+        patch = evenly_pressed(discs.radius_m[alone])
         hands, pads = [discs.hand[alone]], [discs.pad[alone]]
         position = discs.position[alone].T
         found = [self._hand.solve_contacts(pads[0], position, patch, force_n[alone])[0]]
@@ -157,8 +158,7 @@ def _several_discs(discs: _Discs, force_n: FloatArray, rows: IntArray) -> tuple[
     position, force, radius = np.full((shape[0], 2, shape[1]), 0.5), np.zeros(shape), np.full(shape, 1e-3)
     position[lane, :, column] = discs.position[rows]
     force[lane, column], radius[lane, column] = force_n[rows], discs.radius_m[rows]
-    patches = np.stack([radius, np.zeros(shape), np.zeros(shape)], axis=1)
-    return hands, _Snapshots(position, force, patches)
+    return hands, _Snapshots(position, force, evenly_pressed(radius))
 
 
 @dataclass(frozen=True)
@@ -193,13 +193,16 @@ class _NoStimulus:
     node_replacements = ()
     repeat = False
     duration_s = np.inf
-    touch_links: Sequence[tuple[str, float | None]] = ()
+    touch_links: Sequence[str] = ()
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:  # noqa: ARG002
         return []
 
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
+        return drawn
+
     def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> _Snapshots:  # noqa: ARG002
-        return _Snapshots(np.zeros((0, 2, 0)), np.zeros((0, 0)), np.zeros((0, 3, 0)))
+        return _Snapshots(np.zeros((0, 2, 0)), np.zeros((0, 0)), evenly_pressed(np.zeros((0, 0))))
 
     def joint_trajectory(self, robot: object) -> None:
         """Return None: the simulation has the joints."""

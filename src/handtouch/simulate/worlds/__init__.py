@@ -9,6 +9,7 @@ from handtouch.simulate.worlds.distributions import (
     LogNormal,
     LogUniform,
     Normal,
+    OneOf,
     Uniform,
 )
 from handtouch.simulate.worlds.families import Family
@@ -49,6 +50,7 @@ __all__ = [
     "LogUniform",
     "MountSpread",
     "Normal",
+    "OneOf",
     "PartSpread",
     "ShearSpread",
     "SheetKind",

@@ -1,6 +1,7 @@
 """Distributions of hidden quantities.
 
-Public names: `Distribution` and its kinds `Fixed`, `Uniform`, `Normal`, `LogNormal`, `LogUniform`. Their
+Public names: `Distribution` and its kinds `Fixed`, `Uniform`, `Normal`, `LogNormal`, `LogUniform`, `OneOf`.
+Their
 text, as in docs/worlds.md, is `str(distribution)`.
 """
 
@@ -8,12 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+Name = TypeVar("Name", bound=str)
 
 
 class Distribution(Protocol):
@@ -132,3 +134,25 @@ class LogUniform:
 
     def __str__(self) -> str:
         return f"LU({self.low:g}, {self.high:g})"
+
+
+@dataclass(frozen=True)
+class OneOf(Generic[Name]):
+    """Number of one of some names, all equally likely."""
+
+    names: tuple[Name, ...]
+
+    @property
+    def mean(self) -> float:
+        return (len(self.names) - 1) / 2
+
+    @property
+    def std(self) -> float:
+        return math.sqrt((len(self.names) ** 2 - 1) / 12)
+
+    def sample(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Return independent draws (count,)."""
+        return rng.integers(len(self.names), size=count).astype(np.float64)
+
+    def __str__(self) -> str:
+        return ", ".join(self.names)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from handtouch.simulate.worlds.distributions import Distribution, Fixed
+from handtouch.simulate.contact_patch import PROFILES, Profile
+from handtouch.simulate.worlds.distributions import Distribution, Fixed, OneOf
 from handtouch.simulate.worlds.families import Family
 from handtouch.simulate.worlds.sheet_kinds import SheetKind
 
 ZERO, ONE = Fixed(0.0), Fixed(1.0)
+UNIFORM: OneOf[Profile] = OneOf(PROFILES[:1])
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class ContactSpread:
     """Radius less the assumed one, in units of the sheet's contact_radius_std_mm; at least 0.3 of it."""
     elongation: Distribution = ONE
     """Length over width of the elliptical patch; its direction is uniform, its area that of the radius."""
+    profile: OneOf[Profile] = UNIFORM
+    """How its pressure is distributed, one of `PROFILES`."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.hand.pads import mount_transform, rotation_from_rpy
-from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.contact_patch import ContactPatch, Profile
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.surfaces import simulated_surface
@@ -105,11 +105,14 @@ class HiddenContact:
     hertz_force_n: float | None = None
     """Force at which it has this size; None: at every force."""
 
+    profile: Profile = "uniform"
+
     @property
     def patch(self) -> ContactPatch:
         """The patch, in metres."""
-        radius_m = 1e-3 * self.radius_mm
-        return ContactPatch.ellipse(radius_m, self.elongation, self.direction_rad, self.hertz_force_n)
+        return ContactPatch(
+            1e-3 * self.radius_mm, self.elongation, self.direction_rad, self.profile, self.hertz_force_n
+        )
 
 
 @dataclass(frozen=True)
@@ -208,6 +211,7 @@ class DrawnWorld:
             elongation,
             float(patch.uniform(0, np.pi)),
             sheet.hertz_force_n,
+            contacts.profile.names[int(contacts.profile.sample(patch, 1)[0])],
         )
 
     def shear(self, pad_name: str) -> HiddenShear:

@@ -1,0 +1,280 @@
+"""Contacts solved with the sheet beneath them: where the current of a pressed patch enters, and how much.
+
+Public names: `PatchNodes` (patches on pads, as nodes), `look_up_nodes`, `ContactLayer`,
+`solve_patches`.
+
+The layer between conductor and sheet conducts the better the harder it is pressed: sigma = (p /
+p_reference)^alpha over the specific resistance. Its current density is that times what the sheet's potential
+leaves of the drive, and the sheet's potential is the sum of Green's functions of these currents. A patch is a
+few nodes, one linear system per contact. Green's function of two points with conformal radii R and R' at a
+distance d is ln(1 + R R' / d^2) / 4 pi, exact on a disc and beside a straight edge; conformal radii are those
+of the solved sheet. A node's own potential is chosen such that an even density over the whole patch has the
+potential that is known for an ellipse. What hangs over an edge presses on nothing: nodes are moved so that
+they cover the part on the pad, which carries the whole force.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from handtouch.simulate.contact_patch import PROFILES, half_axes
+from handtouch.simulate.pad_geometry import SimulatedSurface
+from handtouch.simulate.sheet_solver import SheetMapBank
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+NODES: Final = 24  # of a patch
+_RINGS, _SPOT_RINGS = 3, 2
+_RING_INSIDE, _SPOT_RADIUS, _SPOT_DISTANCE = 0.6, 0.55, 1.2
+_TILTS = {"half_tilted": 0.5, "tilted": 1.0}
+_MIN_PRESSURE = 1e-9  # over its mean
+_MIN_FORCE_N = 1e-6
+_EDGE = 1e-6  # nearest distance of a node from an edge, in sides
+_CHUNK = 1000  # systems solved at once
+
+
+class ContactLayer(NamedTuple):
+    """Layer of a contact, numbers or (n,)."""
+
+    contact_ohm_m2: FloatArray | float
+    reference_pa: FloatArray | float
+    alpha: FloatArray | float
+
+
+class _Profile(NamedTuple):
+    """Nodes of a profile on the unit disc.
+
+    point: (2, NODES). area: (NODES,). lobe: (NODES,) number of the even part that each is in; centre: (2,
+    NODES), radius: of its part. inside: radius of a hole, over that of the patch. tilt: rise of the pressure
+    along x. shift: x of the centre of pressure.
+    """
+
+    point: FloatArray
+    area: FloatArray
+    lobe: IntArray
+    centre: FloatArray
+    radius: float
+    inside: float
+    tilt: float
+    is_hertz: bool
+
+    @property
+    def shift(self) -> float:
+        return self.tilt / 4
+
+    def pressure(self, point: FloatArray) -> FloatArray:
+        """Return the pressure (k, n), in any unit, at points (k, 2, n)."""
+        if self.is_hertz:
+            return np.asarray(np.sqrt(np.maximum(1 - (point**2).sum(axis=1), _MIN_PRESSURE)))
+        return np.asarray(np.maximum(1 + self.tilt * point[:, 0], _MIN_PRESSURE))
+
+
+@cache
+def _profile(number: int) -> _Profile:
+    name = PROFILES[number]
+    zero = np.zeros((2, NODES))
+    if name == "two_spots":
+        point, area = _disc_nodes(_SPOT_RINGS, NODES // 2 // _SPOT_RINGS, 0.0)
+        side = np.repeat([-1.0, 1.0], NODES // 2)
+        centre = np.stack([side * _SPOT_DISTANCE / 2, np.zeros(NODES)])
+        points = centre + _SPOT_RADIUS * np.tile(point, 2)
+        areas, lobe = _SPOT_RADIUS**2 * np.tile(area, 2), (side > 0).astype(np.intp)
+        return _Profile(points, areas, lobe, centre, _SPOT_RADIUS, 0.0, 0.0, False)
+    inside = _RING_INSIDE if name == "ring" else 0.0
+    nodes = _disc_nodes(_RINGS, NODES // _RINGS, inside)
+    one = np.zeros(NODES, np.intp)
+    return _Profile(*nodes, one, zero, 1.0, inside, _TILTS.get(name, 0.0), name == "hertz")
+
+
+def _disc_nodes(rings: int, around: int, inside: float) -> tuple[FloatArray, FloatArray]:
+    """Return nodes (2, n) on the unit disc outside the radius `inside`, and the areas (n,) that they stand
+    for: Gauss's in the square of the radius."""
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    radius = np.sqrt(inside**2 + (1 - inside**2) * (nodes + 1) / 2)
+    angle = 2 * np.pi * (np.arange(around) + 0.5) / around + (np.arange(rings)[:, None] % 2) * np.pi / around
+    point = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+    return point.reshape(2, -1), np.repeat(weights / 2 * np.pi * (1 - inside**2) / around, around)
+
+
+class PatchNodes(NamedTuple):
+    """Nodes of patches (k,) on one pad or several."""
+
+    position: FloatArray
+    """(k, 2, NODES), fractions of the pad."""
+    place_m: FloatArray
+    """(k, 2, NODES), from the patch's position, of the isotropic equivalent of the sheet."""
+    area_m2: FloatArray
+    """(k, NODES), on the surface."""
+    pressure: FloatArray
+    """(k, NODES), per force [1/m^2]."""
+    own_m: FloatArray
+    """(k, NODES), distance at which another node would have a node's own potential."""
+    radius_ratio: FloatArray
+    """(k, 1), of a conformal radius in the sheet's metric to that on the surface."""
+
+    @classmethod
+    def of_patches(cls, shape: SimulatedSurface, position: FloatArray, patch: FloatArray) -> PatchNodes:
+        """Return the nodes of patches (PATCH_ROWS, k) whose pressures' centres, were they all on the pad, are
+        at positions (2, k), fractions of the pad."""
+        numbers = patch[3].astype(np.intp)
+        groups = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
+        parts = [
+            _nodes_of(shape, position[:, at], patch[:, at], _profile(int(numbers[at[0]]))) for at in groups
+        ]
+        return cls.joined(parts).taken(np.argsort(np.concatenate(groups)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[PatchNodes]) -> PatchNodes:
+        """Return the patches of several parts, one after the other."""
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def taken(self, at: IntArray) -> PatchNodes:
+        """Return the patches of these numbers."""
+        return PatchNodes(*(column[at] for column in self))
+
+    def centres(self, shape: SimulatedSurface, position: FloatArray) -> FloatArray:
+        """Return the centres (2, k) of the pressure on the pad, fractions of it, of patches on one pad."""
+        place_m = (self.place_m * (self.area_m2 * self.pressure)[:, None]).sum(axis=2, keepdims=True)
+        return shape.fractions_beside(position, place_m / _stretch(shape))[:, :, 0].T
+
+
+def _stretch(shape: SimulatedSurface) -> FloatArray:
+    """Return the lengths (2, 1) along x and y in the isotropic equivalent of a sheet."""
+    return np.array([[shape.stretch], [1.0]])
+
+
+def _nodes_of(
+    shape: SimulatedSurface, position: FloatArray, patch: FloatArray, profile: _Profile
+) -> PatchNodes:
+    """Return the nodes of patches of one profile."""
+    axes = half_axes(patch)  # (k, 2, 2)
+    stretch = _stretch(shape)
+    to_fractions = np.stack(
+        [shape.fractions_of(position, axes[:, :, column].T).T for column in (0, 1)], axis=2
+    )
+    point, squeeze = _points_on_pad(position.T - profile.shift * to_fractions[:, :, 0], to_fractions, profile)
+    own = _log_own(stretch * axes, profile) + np.log((1 + squeeze) / 2).sum(axis=1)
+    vector_m = axes @ point - profile.shift * axes[:, :, :1]
+    area = patch[0][:, None] ** 2 * profile.area * squeeze.prod(axis=1)
+    pressure = profile.pressure(point)
+    pressure = pressure / (area * pressure).sum(axis=1, keepdims=True)
+    fractions = np.clip(shape.fractions_beside(position, vector_m), _EDGE, 1 - _EDGE)
+    ratio = np.full((len(axes), 1), (1 + shape.stretch) / 2)
+    return PatchNodes(fractions, stretch * vector_m, area, pressure, np.exp(own), ratio)
+
+
+def _points_on_pad(
+    middle: FloatArray, to_fractions: FloatArray, profile: _Profile
+) -> tuple[FloatArray, FloatArray]:
+    """Return the points (k, 2, NODES) of the unit disc that stand for the part of patches on the pad.
+
+    Second: by what they are nearer to each other along x and y than on the whole patch, (k, 2, NODES).
+    middle: (k, 2) of the patches, fractions of the pad. to_fractions: (k, 2, 2), from the unit disc.
+    """
+    point = np.repeat(profile.point[None], len(middle), axis=0)
+    squeeze = np.ones_like(point)
+    centres = middle[:, :, None] + to_fractions @ profile.centre
+    square = profile.radius**2 * to_fractions @ to_fractions.transpose(0, 2, 1)
+    reach = np.sqrt(square[:, [0, 1], [0, 1]])[:, :, None]
+    over = ((centres - reach < 0) | (centres + reach > 1)).any(axis=(1, 2))
+    for k in np.flatnonzero(over).tolist():
+        at = middle[k, :, None] + to_fractions[k] @ profile.point
+        for axis in (0, 1):  # nodes of a chord of their part move to what of it is on the pad
+            other = square[k, 1 - axis, 1 - axis]
+            aside = at[1 - axis] - centres[k, 1 - axis]
+            half = np.sqrt(np.linalg.det(square[k]) / other * np.maximum(1 - aside**2 / other, 1e-9))
+            begin = centres[k, axis] + square[k, 0, 1] / other * aside - half
+            low, high = np.clip(begin, 0.0, 1.0), np.clip(begin + 2 * half, 0.0, 1.0)
+            squeeze[k, axis] = np.maximum((high - low) / (2 * half), 1e-6)
+            at[axis] = low + squeeze[k, axis] * (at[axis] - begin)
+        point[k] = np.linalg.solve(to_fractions[k], at - middle[k, :, None])
+    return point, squeeze
+
+
+def _log_own(in_metric: FloatArray, profile: _Profile) -> FloatArray:
+    """Return the logarithms (k, NODES) of `PatchNodes.own_m` of whole patches; in_metric: (k, 2, 2), from the
+    unit disc.
+
+    The integral of -ln of the distance over an ellipse with the half axes a and b is, inside it, a b pi (1/2
+    - ln((a + b) / 2)) - pi (b x^2 + a y^2) / (a + b).
+    """
+    square = in_metric @ in_metric.transpose(0, 2, 1)
+    product = np.abs(np.linalg.det(in_metric))  # a b
+    total = np.sqrt(square[:, 0, 0] + square[:, 1, 1] + 2 * product)  # a + b
+    root = (square + product[:, None, None] * np.eye(2)) / total[:, None, None]  # of `square`
+    place, local = in_metric @ profile.point, in_metric @ (profile.point - profile.centre)
+    form = (local * (np.linalg.inv(root) @ local)).sum(axis=1)
+    radius = profile.radius
+    size, sum_of_axes = radius**2 * product, radius * total
+    known = math.pi * (size * (0.5 - np.log(sum_of_axes / 2)))[:, None]
+    known = known - math.pi * product[:, None] / total[:, None] * form
+    if profile.inside:
+        known += math.pi * profile.inside**2 * product[:, None] * np.log(np.hypot(local[:, 0], local[:, 1]))
+    area = product[:, None] * profile.area
+    distance = np.hypot(*np.moveaxis(place[:, :, :, None] - place[:, :, None, :], 1, 0))
+    together = (profile.lobe[:, None] == profile.lobe) & ~np.eye(NODES, dtype=bool)
+    logs = np.log(np.where(together, distance, 1.0))
+    return np.asarray(-(known + (logs * area[:, None, :]).sum(axis=2)) / area)
+
+
+def solve_patches(
+    nodes: PatchNodes,
+    log_radius: FloatArray,
+    shares: FloatArray,
+    number: IntArray,
+    force_n: FloatArray,
+    sheet_ohm: FloatArray | float,
+    layer: ContactLayer,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return resistances (n,) [ohm] of contacts to the grounded electrodes, and shares (n, m) of these.
+
+    log_radius: (k, NODES), logarithm of the conformal radius [m]. shares: (m, k, NODES), of a current at each
+    node. number: (n,) of the patch of each contact; force_n: (n,), that which its layer conducts as. Third:
+    shares (n, NODES) of the nodes in each contact's current.
+    """
+    own = range(NODES)
+    distance_sq = ((nodes.place_m[:, :, :, None] - nodes.place_m[:, :, None, :]) ** 2).sum(axis=1)
+    distance_sq[:, own, own] = nodes.own_m**2
+    radius = np.exp(log_radius) * nodes.radius_ratio
+    green = np.log1p(radius[:, :, None] * radius[:, None, :] / distance_sq) / (4 * math.pi)
+    n = len(number)
+    sheet = np.broadcast_to(np.asarray(sheet_ohm, np.float64), n)
+    contact_ohm_m2, reference_pa, alpha = (
+        np.broadcast_to(np.asarray(value, np.float64), n)[:, None] for value in layer
+    )
+    ohm, mean, by_node = np.empty(n), np.empty((n, len(shares))), np.empty((n, NODES))
+    for first in range(0, n, _CHUNK):
+        at = slice(first, first + _CHUNK)
+        patch = number[at]
+        pressure = np.maximum(force_n[at], _MIN_FORCE_N)[:, None] * nodes.pressure[patch]
+        conductance = nodes.area_m2[patch] * (pressure / reference_pa[at]) ** alpha[at] / contact_ohm_m2[at]
+        system = sheet[at, None, None] * green[patch]
+        system[:, own, own] += 1 / conductance
+        current = np.linalg.solve(system, np.ones((len(patch), NODES, 1)))[:, :, 0]
+        total = current.sum(axis=1)
+        ohm[at], by_node[at] = 1 / total, current / total[:, None]
+        mean[at] = np.einsum("mnk,nk->nm", shares[:, patch], by_node[at])
+    return ohm, mean, by_node
+
+
+def look_up_nodes(
+    bank: SheetMapBank, sheet: IntArray, nodes: PatchNodes
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return logarithms of conformal radii (k, NODES), shares (m, k, NODES) and their derivatives (m, 2, k,
+    NODES) by position at the nodes of patches on sheets (k,)."""
+    k = len(nodes.position)
+    values, slopes = bank.look_up_anywhere(
+        np.repeat(sheet, NODES), *nodes.position.transpose(1, 0, 2).reshape(2, -1)
+    )
+    return (
+        values[-1].reshape(k, NODES),
+        values[:-1].reshape(-1, k, NODES),
+        slopes[:-1].reshape(-1, 2, k, NODES),
+    )
