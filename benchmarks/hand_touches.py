@@ -123,7 +123,9 @@ class TouchReadings:
             counts[:, row, : len(pad.electrode_names)] = hand.counts(row, times_s)
         ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
         truths = {
-            (k, truth.link): truth for tick, k in ticks.items() for truth in hand.truth(float(times_s[tick]))
+            (k, truth.link): truth
+            for tick, k in ticks.items()
+            for truth in reversed(hand.truth(float(times_s[tick])))  # the first touch of those at once
         }
         return cls(counts, ticks, truths)
 

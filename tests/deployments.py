@@ -13,6 +13,7 @@ begin_ms = 5.0
 end_ms = 5.0
 """
 EXACT_NODE = "gain_std = 0.0\nseries_std = 0.0\n"
+PLAIN_SHEET = "crowding = false\ncontact_elongation_std = 0.0\ncontact_tilt_std = 0.0\nunevenness_std = 0.0\n"
 SHEET_TOLERANCES = (
     *("ohm_per_square_std", "contact_ohm_std", "alpha_std"),
     *("anisotropy_std", "gap_std_mm", "size_std_mm"),
@@ -52,6 +53,7 @@ def deployment_text(
 drive_v = 5.0
 full_scale_ma = {full_scale_ma}
 noise_counts = {noise_counts}
+series_std_ohm = 0.0
 {EXACT_NODE if exact_parts else ""}
 [sheet.s]
 ohm_per_square = 2400.0
@@ -59,8 +61,7 @@ contact_ohm_mm2 = 20000.0
 alpha = 1.5
 contact_radius_mm = {contact_radius_mm}
 contact_radius_std_mm = {contact_radius_std_mm}
-crowding = false
-{EXACT_SHEET if exact_parts else ""}
+{PLAIN_SHEET}{EXACT_SHEET if exact_parts else ""}
 [touch]
 {touch.strip()}
 

@@ -87,7 +87,8 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
         fractions = model.networks[row].fractions(x * model.networks[row].a, y * model.networks[row].b)
         for number, one in enumerate(np.eye(4)):
             exact = change(*(other_network(deployment, row, log_series=step * one) for step in (1e-3, -1e-3)))
-            tabulated = table.series_vectors[number][:, None, None] * fractions[number]
+            per_ohm = table.series_vectors[number] * model.networks[row].series_ohm[number]
+            tabulated = per_ohm[:, None, None] * fractions[number]
             assert np.abs(tabulated - exact / 2e-3).max() < 1e-4 * np.abs(exact / 2e-3).max()
 
 

@@ -63,7 +63,7 @@ def test_a_resistor_changes_the_fractions_of_its_state_as_stated(scheduled: Elec
     for electrode in range(8):
         ohm = OHM * np.exp(step * (np.arange(8) == electrode))
         change = (scheduled.with_series_ohm(ohm.tolist()).fractions(X, Y) - fractions) / step
-        stated = scheduled.series_sensitivity[:, [electrode]] * fractions[electrode]
+        stated = OHM * scheduled.series_sensitivity[:, [electrode]] * fractions[electrode]
         np.testing.assert_allclose(change, stated, atol=1e-7)
 
 

@@ -52,7 +52,8 @@ def pad_value(name: str) -> Draw:
 def resistor_ratio(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
     pad = deployment.hands[0].pads[1]
     used = np.array(pad.series_ohm) > 0
-    return (np.array(drawn.pad("right", pad).series_ohm)[used] / np.array(pad.series_ohm)[used]).tolist()
+    resistors = np.array(drawn.pad("right", pad).series_ohm) - drawn.lead_ohm("right/round")
+    return (resistors[used] / np.array(pad.series_ohm)[used]).tolist()
 
 
 def gap_offset(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
@@ -79,10 +80,18 @@ def shear_value(name: str) -> Draw:
     return lambda drawn, _: getattr(shear_parts(drawn.world.name, drawn.seed), name)
 
 
+CHANNEL_ERRORS = ("common_noise_counts", "hum_counts", "crosstalk", "nonlinearity_counts")
+
+
+def channel_value(name: str) -> Draw:
+    return lambda drawn, _: getattr(drawn.channel_errors("right/round"), name)
+
+
 DRAWS: dict[str, Draw] = {
     "parts.gain_ratio": pad_value("gain_ratio"),
     "parts.gap_offset_mm": gap_offset,
     "parts.resistor_ratio": resistor_ratio,
+    "parts.lead_ohm": lambda drawn, _: drawn.lead_ohm("right/round"),
     "parts.sheet_ohm_ratio": pad_value("sheet_ohm_ratio"),
     "parts.anisotropy_ratio": pad_value("anisotropy_ratio"),
     "parts.unevenness": pad_value("unevenness"),
@@ -102,6 +111,7 @@ DRAWS: dict[str, Draw] = {
     "sheets.alpha_offset": pad_value("alpha_offset"),
     "sheets.parameter_ratio": lambda drawn, _: drawn.sheet_factors("right/round"),
     "electronics.noise_ratio": pad_value("noise_ratio"),
+    **{f"electronics.{name}": channel_value(name) for name in CHANNEL_ERRORS},
     "electronics.zero_drift_counts_per_s": hand_rate("zero_drift_counts_per_s"),
     "electronics.temperature_drift_k_per_s": hand_rate("temperature_drift_k_per_s"),
     "electronics.offset_counts_per_k": pad_value("offset_counts_per_k"),

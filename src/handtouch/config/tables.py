@@ -205,6 +205,11 @@ class Node(Table):
     series_std: Annotated[float, Field(ge=0, le=1)] = Field(
         0.03, description="relative error of a series resistor (1 sigma); default: that of +-5 %"
     )
+    series_std_ohm: NonNegative = Field(
+        1.2,
+        description="resistance of the way from an electrode to its channel, electrode included, besides "
+        "series_ohm (1 sigma); default: that of copper or short silver tracks, up to 2",
+    )
     idle: Idle | None = Field(None, description="transmission while untouched; default: with every SYNC")
     excitation_object: str | None = Field(
         None,
@@ -335,9 +340,15 @@ class Sheet(Table):
         examples=[2.0],
     )
     contact_elongation_std: Annotated[float, Field(ge=0, le=2)] = Field(
-        0.0,
+        0.4,
         description="logarithm of a contact's length over its width, in any direction (1 sigma); default: "
-        "round",
+        "that of objects of many shapes; 0: round",
+    )
+    contact_tilt_std: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.3,
+        description="rise of the pressure from the middle of a contact to its rim, over the mean, along any "
+        "direction (1 sigma): current and pressure have different centres; default: that of objects pressed "
+        "on unevenly; 0: evenly",
     )
     crowding: bool = Field(
         True,
@@ -372,9 +383,9 @@ class Sheet(Table):
         description="error of a pad's gap_mm, each end of an electrode (1 sigma); default: that of +-0.2",
     )
     unevenness_std: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.0,
+        0.02,
         description="relative amplitude of each of the five longest waves of the sheet resistance over a pad "
-        "(1 sigma); a film of +-10 % has about 0.04",
+        "(1 sigma); a film of +-10 % has about 0.04; default: that of +-5 %",
     )
     size_std_mm: NonNegative = Field(
         0.06, description="error of a pad's length and width (1 sigma); default: that of +-0.1"

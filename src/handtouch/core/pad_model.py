@@ -22,7 +22,7 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
-from handtouch.core.part_tolerances import stage_tolerances
+from handtouch.core.part_tolerances import shape_error, stage_tolerances
 from handtouch.core.shear import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
@@ -42,11 +42,11 @@ from handtouch.hand import (
 from handtouch.hand.pads import sheet_law
 
 FloatArray = NDArray[np.float64]
-_NODE_TOLERANCES = {"gain_std", "series_std"}
+_NODE_TOLERANCES = {"gain_std", "series_std", "series_std_ohm"}
 _SHEET_TOLERANCES = {
     *("ohm_per_square_std", "contact_ohm_std", "alpha_std", "anisotropy_std", "gap_std_mm", "size_std_mm"),
     *("unevenness_std", "contact_elongation_std", "max_force_n", "pair_false_alarm", "max_contact_length_mm"),
-    "crowding",
+    *("contact_tilt_std", "crowding"),
 }
 
 
@@ -233,7 +233,10 @@ class PadModel:
         self.part_offsets[pad] = self.touch_errors[pad] = 0.0
         if parts is not None:
             axes = _triangle(np.array(parts.covariance))
-            self.part_offsets[pad, : size - count], self.touch_errors[pad] = parts.offsets, parts.touch_error
+            self.part_offsets[pad, : size - count] = parts.offsets
+            # scores of contacts that aren't round, which the sheet states already, are among those measured
+            stated = shape_error(*self._parts[pad][::2], self._whole_tables[pad])
+            self.touch_errors[pad] = math.sqrt(max(parts.touch_error**2 - stated**2, 0.0))
         else:
             axes = np.eye(size)
             axes[:count, :count] = _triangle(self.gain_covariance[pad, :count, :count])

@@ -93,7 +93,7 @@ class ForwardTable:
     logarithm of a / b, by waves of the sheet resistance, and second ones by x x and x y, see
     `PadTolerances`. end_vectors: (2 n, n), derivatives of the fractions by the bare length at each end, two
     of each electrode, per its field.
-    series_vectors: (n, n), by the logarithm of each resistor, per its electrode's fraction.
+    series_vectors: (n, n), by each resistor [1/ohm], per its electrode's fraction.
     """
 
     nodes: FloatArray

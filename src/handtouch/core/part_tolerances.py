@@ -1,6 +1,6 @@
 """Tolerances of a pad's parts as a deployment states them, for the stages.
 
-Public names: `stage_tolerances`, `overhangs`, `OVERHANG_STEP`.
+Public names: `stage_tolerances`, `shape_error`, `overhangs`, `OVERHANG_STEP`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages.tolerances import PadTolerances
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
-from handtouch.hand.pads import log_aspect_std, metres_per_unit, pad_surface, relative_size_stds
+from handtouch.hand.pads import (
+    log_aspect_std,
+    metres_per_unit,
+    pad_surface,
+    relative_size_stds,
+    series_ohm_stds,
+)
 
 FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
@@ -26,6 +32,8 @@ OVERHANG_STEP = 1 / 16
 _STATE_STD = 0.08
 """Standard deviation of the logarithm of a contact's current in one state of a schedule, by its force."""
 _STATE_GRID = (np.arange(12) + 0.5) / 12
+_MARGIN = 0.1  # of the sides, of typical contacts
+_MIN_SERIES_STD = 1e-6  # relative; that of the sheet resistance is in multiples of it
 _OVERHANGS, _DIRECTIONS, _SEGMENT_POINTS = 33, 8, 24
 
 
@@ -42,7 +50,11 @@ def stage_tolerances(
     aspect_std = log_aspect_std(pad, sheet)
     end_stds = sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network)
     end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
-    has_series = any(pad.series_ohm)
+    series_ohm = np.array(pad.series_ohm)
+    series_stds = np.maximum(series_ohm_stds(pad, node), _MIN_SERIES_STD * series_ohm)
+    series_vectors = np.ascontiguousarray(series_stds[:, None] * table.series_vectors)
+    has_series = bool(series_vectors.any())
+    by_sheet = sheet.ohm_per_square_std * series_ohm / np.where(series_stds > 0, series_stds, 1.0)
     elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
     is_elongated = bool(elongations.any())
     radius_m = math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm) * _M_PER_MM
@@ -53,9 +65,8 @@ def stage_tolerances(
         view_memory(end_vectors),
         aspect_std,
         sheet.unevenness_std,
-        view_memory(table.series_vectors),
-        node.series_std,
-        sheet.ohm_per_square_std,
+        view_memory(series_vectors),
+        view_memory(by_sheet),
         has_series,
         surface.extent_m[0] / 2,
         size_x,
@@ -64,6 +75,8 @@ def stage_tolerances(
         view_memory(radius_m * overhangs(sheet.contact_elongation_std)),
         radius_m * OVERHANG_STEP,
         is_elongated,
+        sheet.contact_tilt_std,
+        math.sinh(sheet.contact_elongation_std),
         pad.state_count,
         view_memory(np.array(channel_states(pad) or [0] * len(pad.electrode_names), dtype=np.intp)),
         _STATE_STD if pad.switch_states else 0.0,
@@ -107,6 +120,15 @@ def overhangs(elongation_std: float) -> FloatArray:
         square += likely * density * shift**2
         weight += likely * density
     return np.asarray(np.sqrt(square / np.maximum(weight, 1e-300)))
+
+
+def shape_error(pad: config.Pad, sheet: config.Sheet, table: ForwardTable) -> float:
+    """Return a typical standard deviation of a fraction by contacts that are elongated as stated."""
+    x, y = (nodes[::CELLS_PER_TOLERANCE_CELL, 0] for nodes in (table.nodes_x, table.nodes_y))
+    second = table.tolerance_nodes[:, :, 0, -2 * table.electrodes :].astype(np.float64)
+    square = (second**2).sum(axis=2) / table.electrodes * _elongations(sheet, pad_surface(pad), x) ** 2
+    inside = [(at > _MARGIN * at[-1]) & (at < (1 - _MARGIN) * at[-1]) for at in (y, x)]
+    return float(np.sqrt(np.median(square[np.ix_(*inside)])))
 
 
 def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatArray:

@@ -94,12 +94,13 @@ class GroundedElectrodes(ABC):
 
     @property
     def series_sensitivity(self) -> FloatArray:
-        """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f by S[:, j] f[j]."""
-        drop = np.asarray(self.series_ohm) / self.sheet_ohm_per_square
-        drop = np.where(np.isfinite(drop), drop, 0.0)
-        if not drop.any():  # between electrodes that touch, the conductance is infinite
+        """Matrix S (m, m) [1/ohm]: more of resistor j changes the measured fractions f by S[:, j] f[j].
+
+        0 where electrodes touch: any resistance between them makes the currents of both unknown.
+        """
+        if not np.isfinite(self.conductance).all():
             return np.zeros_like(self._mix)
-        return -self._mix @ self.conductance * drop
+        return np.asarray(-self._mix @ self.conductance / self.sheet_ohm_per_square)
 
     @property
     def currents_per_ideal(self) -> FloatArray:

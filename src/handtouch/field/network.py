@@ -271,7 +271,7 @@ class ElectrodeNetwork(GroundedElectrodes):
 
     @property
     def series_sensitivity(self) -> FloatArray:
-        """Matrix S (m, m): the logarithm of resistor j changes the measured fractions f of its state by
+        """Matrix S (m, m) [1/ohm]: more of resistor j changes the measured fractions f of its state by
         S[:, j] f[j]."""
         if not self.states:
             return super().series_sensitivity

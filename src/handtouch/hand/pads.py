@@ -1,8 +1,8 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
 Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_network`, `electrode_network`,
-`models_with_other_parts`, `part_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`,
-`rotation_from_rpy`, `MountUncertainty`.
+`models_with_other_parts`, `part_stds`, `series_ohm_stds`, `metres_per_unit`, `relative_size_stds`,
+`log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -126,10 +126,8 @@ def models_with_other_parts(
     models += [nominal.with_moved_end(end, step) for end, step in enumerate(steps.tolist())]
     models.append(nominal.stretched(math.exp(log_aspect_std(pad, sheet))))
     models += [UnevenSheet(nominal, wave, sheet.unevenness_std) for wave in range(len(UNEVEN_WAVES))]
-    changes = [node.series_std * one for one in np.eye(len(ohm))] + [
-        np.full(len(ohm), -sheet.ohm_per_square_std)
-    ]
-    models += [nominal.with_series_ohm(ohm * np.exp(change)) for change in changes]
+    models += [nominal.with_series_ohm(ohm + more) for more in np.diag(series_ohm_stds(pad, node))]
+    models.append(nominal.with_series_ohm(ohm * math.exp(-sheet.ohm_per_square_std)))
     return tuple(model if std else nominal for model, std in zip(models, stds, strict=True))
 
 
@@ -137,14 +135,19 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
     """Return the standard deviations of a pad's parts; 0 for those that don't matter.
 
     Gaps [mm] at both ends of each electrode; logarithms of the ratio of the sides, of the waves of the sheet
-    resistance (`UNEVEN_WAVES`), of each series resistor, and of the sheet resistance beside these.
+    resistance (`UNEVEN_WAVES`); each series resistor with its lead [ohm]; logarithm of the sheet resistance
+    beside these.
     """
     count = len(pad.electrode_names)
-    resistors = (*(node.series_std,) * count, sheet.ohm_per_square_std)
-    if not any(pad.series_ohm):
-        resistors = (0.0,) * (count + 1)
+    sheet_std = sheet.ohm_per_square_std if any(pad.series_ohm) else 0.0
+    resistors = (*series_ohm_stds(pad, node).tolist(), sheet_std)
     waves = (sheet.unevenness_std,) * len(UNEVEN_WAVES)
     return (*(sheet.gap_std_mm,) * (2 * count), log_aspect_std(pad, sheet), *waves, *resistors)
+
+
+def series_ohm_stds(pad: config.Pad, node: config.Node) -> NDArray[np.float64]:
+    """Return the standard deviations of the resistances from a pad's electrodes to ground, (c,) [ohm]."""
+    return np.hypot(node.series_std * np.array(pad.series_ohm), node.series_std_ohm)
 
 
 def metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> NDArray[np.float64]:

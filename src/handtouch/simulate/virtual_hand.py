@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch import config
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
+from handtouch.simulate.channel_errors import ChannelErrors
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault
@@ -77,6 +78,12 @@ class VirtualHand:
             [(row.hand, row.pad.link) for row in self.virtual_pads],
             [row.pad.electrode_names for row in self.virtual_pads],
         )
+        self._errors = ChannelErrors(
+            world,
+            [(row.hand, row.pad.link) for row in self.virtual_pads],
+            [len(row.pad.electrode_names) for row in self.virtual_pads],
+            [float(row.limits[:, 1].min()) for row in self.virtual_pads],
+        )
         self._special_rows = [
             number
             for number, row in enumerate(self.virtual_pads)
@@ -129,6 +136,8 @@ class VirtualHand:
         counts = self._noise[:, None] * noise.standard_normal(keys, round(t_s * 1e9))
         if not self._drift.is_constant:
             counts += self._drift.zero_counts(np.array([t_s]))
+        if self._errors.disturbs:
+            counts += self._errors.disturbance(np.array([t_s]))
         return np.asarray(counts)
 
     def counts_per_ampere(self, t_s: float) -> FloatArray:
@@ -146,6 +155,8 @@ class VirtualHand:
 
     def quantise(self, counts: FloatArray) -> NDArray[np.int64]:
         """Return readings (..., pads, c) of the converters."""
+        if self._errors.distorts:
+            counts = self._errors.distorted(counts)
         return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
 
     def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.hand.pads import mount_transform
 from handtouch.simulate import noise
+from handtouch.simulate.channel_errors import ChannelErrors
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault, Gum, StuckChannel
 from handtouch.simulate.pad_circuit import PadCircuit
@@ -59,6 +60,8 @@ class VirtualPad:
     """Times of node replacements [s], with the gains (m,) of the new node relative to the first one's."""
     drift: ElectronicsDrift
     """Drift of this pad."""
+    errors: ChannelErrors
+    """Errors of its channels."""
     sheet_law: SheetLaw | None
     repeat_period_s: float
     """Period after which the scenario repeats; infinite: it doesn't."""
@@ -123,6 +126,7 @@ class VirtualPad:
                 if node.link == pad.link
             ),
             ElectronicsDrift(world, [(hand, pad.link)], [pad.electrode_names]),
+            ChannelErrors(world, [(hand, pad.link)], [len(pad.electrode_names)], [float(limits[:, 1].min())]),
             hidden.sheet_law,
             repeat_s,
             shear,
@@ -225,6 +229,10 @@ class VirtualPad:
             counts[active] = fault.distort_counts(counts[active])
         sample_ns = np.rint(times_s * 1e9).astype(np.int64)
         counts += self.noise_counts * noise.standard_normal(self.noise_keys, sample_ns[:, None])
+        if self.errors.disturbs:
+            counts += self.errors.disturbance(times_s)[:, 0]
+        if self.errors.distorts:
+            counts = self.errors.distorted(counts[:, None])[:, 0]
         readings = np.clip(np.rint(counts), *self.limits.T).astype(np.int64)
         for fault in faults:
             active = np.flatnonzero(fault.is_active(scenario_s))

@@ -23,7 +23,7 @@ cdef class ForceResult:
     cdef public double force_n, std_n
     cdef double left, high, low, bend, by_radius, variance, sigma, std, step, density
     cdef double spreading, gradient2, total
-    cdef public double shift, shift_std
+    cdef public double shift, shift_std, tilt_m
     cdef public Py_ssize_t status
 
 @cython.locals(is_limited=bint)

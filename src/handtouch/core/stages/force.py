@@ -44,6 +44,7 @@ _MAX_STEPS, _CONVERGED_SIGMA = 12, 0.1
 _CROWDING_STEPS, _MIN_CROWDED_FACTOR = 4, 0.05
 _CROWDING_NEAR = 0.3
 """By how much more the current's centre moves where a disc touches the edge, per I2 / I0"""
+_TILT_REST = 0.1  # of the distance of both centres, over the pressure's from the middle
 _CROWDING_STD = 0.2
 """Relative: pressures that aren't even (Hertz), and the law's tolerances"""
 
@@ -102,7 +103,7 @@ class ForceResult:
     logarithm of `left`.
     At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its logarithm is above the
     expected one, `total`; `density` of the logarithm, over that of `sigma`; and ln x^2 a standard deviation,
-    `step`. `shift`, `shift_std`: see `find_crowding`.
+    `step`. `shift`, `shift_std`, `tilt_m`: see `find_crowding`.
     """
 
     def __init__(self) -> None:
@@ -110,7 +111,7 @@ class ForceResult:
         self.status = _NOT_ESTIMATED
         self.left = self.high = self.low = self.bend = self.by_radius = self.variance = 0.0
         self.spreading = self.gradient2 = self.total = 0.0
-        self.shift = self.shift_std = 0.0
+        self.shift = self.shift_std = self.tilt_m = 0.0
         self.sigma = self.std = self.step = self.density = 0.0
 
 
@@ -326,6 +327,10 @@ def find_crowding(
     image in the edge the current's centre moves I2(x) / I0(x) A^2 / 2 grad ln R, a little more near the edge
     (by the disc solved there: half as much more as the square of A grad ln R). Of a contact over the edge the
     part on the pad moves. The deviation is that by the radius, and of the model.
+
+    Set `tilt_m` [m]: how far the centres of current and pressure are from each other where the pressure
+    rises from the middle to the rim by its mean. The pressure's is A / 4 from the middle, the current's is
+    alpha I1(x) / (2 x I0(x)) A from it, to first order of the rise; what is left out, besides.
     """
     whole = whole_factor(law, total_a)
     left = max(whole - whole / law.parameters[_DRIVE] * total_a * series_ohm, _MIN_LEFT)
@@ -334,7 +339,7 @@ def find_crowding(
     wide = narrow = 0.0
     for step in range(3):
         log_radius = law.parameters[_LOG_RADIUS] + (step - 1) * std
-        shift = 0.0
+        shift = share = radius = 0.0
         log_x2 = law.parameters[_LOG_X2]
         for _ in range(1 if law.parameters[_GROWTH] == 0.0 else _CROWDING_STEPS):
             radius = log_radius + law.parameters[_GROWTH] * (log_x2 - law.parameters[_LOG_X2])
@@ -350,6 +355,8 @@ def find_crowding(
             narrow = shift
         elif step == 1:
             result.shift = shift
+            uneven = (1.0 - 0.5 * law.parameters[_BY_RADIUS]) * (1.0 - share) - 1.0
+            result.tilt_m = 0.25 * math.exp(radius) * math.sqrt(uneven * uneven + _TILT_REST * _TILT_REST)
         else:
             wide = shift
     by_radius, by_model = 0.5 * (wide - narrow), _CROWDING_STD * result.shift

@@ -71,7 +71,8 @@ cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) no
 @cython.locals(row=Py_ssize_t, values='double[::1]', chance=double)
 cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(fit=locate.Fit, table=locate.ModelTable, at=tables.Placement, n=Py_ssize_t, law=force.PadLaw,
-               result=force.ForceResult)
+               result=force.ForceResult, parts=tolerances.PadTolerances, spread=double,
+               moved=double, gradient2=double)
 cdef void _correct_crowding(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(row=Py_ssize_t, fit=locate.Fit, at=tables.Placement, values='double[::1]')
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept

@@ -205,7 +205,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     if parts.states > 1 and last_x == last_x:
         lag = 1.0 * (parts.states - 1)
         solver.moved_x, solver.moved_y = lag * (fit.x - last_x), lag * (fit.y - last_y)
-    if solver.crowding[pad]:
+    if solver.crowding[pad] or parts.tilt_std > 0.0:
         _correct_crowding(solver, pad)
     _write_position(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and solver.pair_limits[pad] < _INFINITY and not saturated:
@@ -529,20 +529,35 @@ def _estimate_force(solver: ContactSolver, pad: int, share: float) -> None:
 
 
 def _correct_crowding(solver: ContactSolver, pad: int) -> None:
-    """Move the position from the centre of the current to that of the contact; add the covariance of that."""
+    """Move the position from the centre of the current to that of the contact; add the covariance of that,
+    and of the centre of a pressure that isn't even."""
     fit, table, at = solver.fit, solver.models[pad], solver.placement
-    n, law, result = fit.whitening.electrodes, solver.laws[pad], solver.result
+    n, law, result, parts = (
+        fit.whitening.electrodes,
+        solver.laws[pad],
+        solver.result,
+        solver.pad_tolerances[pad],
+    )
     slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
     scale2 = at.scale_m * at.scale_m
+    gradient2 = (slope_x * slope_x + slope_y * slope_y) / scale2
     force.find_crowding(
         solver.stack,
         law,
         result,
         fit.total,
         fit.raw[n] + math.log(at.scale_m),
-        (slope_x * slope_x + slope_y * slope_y) / scale2,
+        gradient2,
         force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
     )
+    spread = parts.tilt_std * parts.tilt_std * result.tilt_m * result.tilt_m
+    if solver.crowding[pad]:  # an elongated contact moves more or less, and aside
+        moved = parts.moment_std * result.shift
+        spread += moved * moved * gradient2
+    fit.var_x += spread / (at.along_m * at.along_m)
+    fit.var_y += spread / (at.around_m * at.around_m)
+    if not solver.crowding[pad]:
+        return
     std_x, std_y = result.shift_std / scale2 * slope_x, result.shift_std / scale2 * slope_y
     if fit.var_x < 1e300 and fit.var_y < 1e300:
         fit.var_x += std_x * std_x

@@ -6,9 +6,9 @@ cdef Py_ssize_t _WAVES
 
 cdef class PadTolerances:
     cdef float[::1] values
-    cdef double[::1] end_vectors, series_vectors
+    cdef double[::1] end_vectors, series_vectors, series_by_sheet
     cdef Py_ssize_t cells
-    cdef double cell_ratio, aspect_std, wave_std, series_std, sheet_std, middle_u_m, size_x, size_y
+    cdef double cell_ratio, aspect_std, wave_std, tilt_std, moment_std, middle_u_m, size_x, size_y
     cdef double[::1] elongations, overhangs
     cdef double overhang_step_m
     cdef Py_ssize_t states

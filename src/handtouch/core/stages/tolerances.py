@@ -23,10 +23,12 @@ class PadTolerances:
     of a schedule, then derivatives of the n fractions by the logarithm of the ratio of the sides, by each
     wave of the sheet resistance, by x x and by x y. end_vectors: (2 n n,) changes of fractions by one
     standard deviation of each end, per its field. aspect_std, wave_std: of that logarithm, and of a wave.
-    series_vectors: (n n,) changes by the logarithm of each resistor, per its electrode's fraction;
-    series_std, sheet_std: of the logarithms of resistors and sheet resistance. middle_u_m: arc length from
-    the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its sides.
-    elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies derivatives
+    series_vectors: (n n,) changes by one standard deviation of each resistor, per its electrode's fraction;
+    series_by_sheet: (n,) standard deviations of each resistor to which one of the sheet resistance is equal.
+    tilt_std: rise of a contact's pressure to its rim, over its mean, along any direction; moment_std:
+    relative difference of its second moment along any direction from that of a round one. middle_u_m: arc
+    length from the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its
+    sides. elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies derivatives
     by x x and x y with. overhangs: (k,) root mean square shift [m] of positions from an edge that an
     elongated contact hangs over, at multiples of `overhang_step_m` from it. states: of a schedule, 1 without
     one; state_of: (n,) state in which each electrode is measured; state_std, state_std_per_a: of the
@@ -42,8 +44,7 @@ class PadTolerances:
         aspect_std: float,
         wave_std: float,
         series_vectors: memoryview[float],
-        series_std: float,
-        sheet_std: float,
+        series_by_sheet: memoryview[float],
         has_series: bool,
         middle_u_m: float,
         size_x: float,
@@ -52,6 +53,8 @@ class PadTolerances:
         overhangs: memoryview[float],
         overhang_step_m: float,
         is_elongated: bool,
+        tilt_std: float,
+        moment_std: float,
         states: int,
         state_of: memoryview[int],
         state_std: float,
@@ -64,9 +67,10 @@ class PadTolerances:
         self.end_vectors = end_vectors
         self.aspect_std, self.wave_std = aspect_std, wave_std
         self.series_vectors = series_vectors
-        self.series_std, self.sheet_std, self.has_series = series_std, sheet_std, has_series
+        self.series_by_sheet, self.has_series = series_by_sheet, has_series
         self.middle_u_m, self.size_x, self.size_y = middle_u_m, size_x, size_y
         self.elongations, self.is_elongated = elongations, is_elongated
+        self.tilt_std, self.moment_std = tilt_std, moment_std
         self.overhangs, self.overhang_step_m = overhangs, overhang_step_m
         self.states, self.state_of = states, state_of
         self.state_std, self.state_std_per_a = state_std, state_std_per_a
@@ -358,10 +362,10 @@ def _add_changes(
             together = 0.0
             for k in range(n):
                 change = pad.series_vectors[k * n + i] * fractions[first + k]
-                changes[resistor + k * n] += pad.series_std * change * scale
-                together += change
+                changes[resistor + k * n] += change * scale
+                together += pad.series_by_sheet[k] * change
             # a larger sheet resistance is a smaller one of every resistor
-            changes[resistor + n * n] -= pad.sheet_std * together * scale
+            changes[resistor + n * n] -= together * scale
 
 
 def _add_elongation(

@@ -26,6 +26,7 @@ from handtouch.simulate.worlds.spreads import (
 from handtouch.simulate.worlds.world import (
     UNEVEN_MODES,
     DrawnWorld,
+    HiddenChannels,
     HiddenContact,
     HiddenJoints,
     HiddenPad,
@@ -42,6 +43,7 @@ __all__ = [
     "ElectronicsSpread",
     "Family",
     "Fixed",
+    "HiddenChannels",
     "HiddenContact",
     "HiddenJoints",
     "HiddenPad",

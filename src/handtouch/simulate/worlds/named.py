@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-from handtouch.simulate.worlds.distributions import Fixed, LogNormal, LogUniform, Normal, Uniform
+from handtouch.simulate.contact_patch import PROFILES
+from handtouch.simulate.worlds.distributions import Fixed, LogNormal, LogUniform, Normal, OneOf, Uniform
 from handtouch.simulate.worlds.shear_spread import ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
 from handtouch.simulate.worlds.spreads import (
@@ -35,8 +36,10 @@ _DEFAULT = World(
         gain_ratio=Uniform(0.98, 1.02),
         gap_offset_mm=Uniform(-0.2, 0.2),
         resistor_ratio=Uniform(0.95, 1.05),
+        lead_ohm=Uniform(0.0, 2.0),
         sheet_ohm_ratio=LogNormal(1.0, 0.1),
         anisotropy_ratio=LogNormal(1.0, 0.02),
+        unevenness=Normal(0.0, 0.02),
         length_offset_mm=Uniform(-0.1, 0.1),
         width_offset_mm=Uniform(-0.1, 0.1),
     ),
@@ -47,7 +50,7 @@ _DEFAULT = World(
         joint_noise_deg=Fixed(0.05),
         joint_delay_s=Fixed(0.003),
     ),
-    ContactSpread(radius_sigma=Normal(0.0, 1.0)),
+    ContactSpread(radius_sigma=Normal(0.0, 1.0), elongation=LogUniform(1.0, 2.0), profile=OneOf(PROFILES)),
     SheetSpread(
         contact_ohm_ratio=LogNormal(1.0, 0.06),
         alpha_offset=Normal(0.0, 0.05),
@@ -57,6 +60,10 @@ _DEFAULT = World(
     ),
     ElectronicsSpread(
         noise_ratio=LogNormal(1.0, 0.1),
+        common_noise_counts=Fixed(0.2),
+        hum_counts=Uniform(0.0, 0.5),
+        crosstalk=Uniform(0.0, 2e-4),
+        nonlinearity_counts=Normal(0.0, 0.5),
         zero_drift_counts_per_s=Fixed(0.05),
         temperature_drift_k_per_s=Fixed(0.01),
         offset_counts_per_k=Normal(0.0, 2.0),
@@ -85,6 +92,7 @@ _HARSH = World(
         gain_ratio=Uniform(0.95, 1.05),
         gap_offset_mm=Uniform(-0.5, 0.5),
         resistor_ratio=Uniform(0.88, 1.12),
+        lead_ohm=Uniform(0.0, 5.0),
         sheet_ohm_ratio=LogNormal(1.0, 0.25),
         anisotropy_ratio=LogNormal(1.0, 0.05),
         unevenness=Normal(0.0, 0.05),
@@ -98,7 +106,7 @@ _HARSH = World(
         joint_noise_deg=Fixed(0.12),
         joint_delay_s=Fixed(0.008),
     ),
-    ContactSpread(radius_sigma=Normal(0.0, 2.0), elongation=LogUniform(1.0, 3.0)),
+    ContactSpread(radius_sigma=Normal(0.0, 2.0), elongation=LogUniform(1.0, 3.0), profile=OneOf(PROFILES)),
     SheetSpread(
         contact_ohm_ratio=LogNormal(1.0, 0.15),
         alpha_offset=Normal(0.0, 0.12),
@@ -113,6 +121,10 @@ _HARSH = World(
     ),
     ElectronicsSpread(
         noise_ratio=LogNormal(1.0, 0.25),
+        common_noise_counts=Fixed(0.5),
+        hum_counts=Uniform(0.0, 1.25),
+        crosstalk=Uniform(0.0, 5e-4),
+        nonlinearity_counts=Normal(0.0, 1.25),
         zero_drift_counts_per_s=Fixed(0.12),
         temperature_drift_k_per_s=Fixed(0.025),
         offset_counts_per_k=Normal(0.0, 5.0),

@@ -27,6 +27,8 @@ class PartSpread:
     """Bare length at each end of each electrode, less the configured one; a length below 0 counts as 0."""
     resistor_ratio: Distribution = ONE
     """Series resistor of an electrode."""
+    lead_ohm: Distribution = ZERO
+    """Resistance of an electrode's lead and of the electrode itself, besides series resistors."""
     sheet_ohm_ratio: Distribution = ONE
     """Sheet resistance."""
     anisotropy_ratio: Distribution = ONE
@@ -93,6 +95,14 @@ class ElectronicsSpread:
 
     noise_ratio: Distribution = ONE
     """Standard deviation of a pad's readings."""
+    common_noise_counts: Distribution = ZERO
+    """Standard deviation of noise that all channels of a pad share."""
+    hum_counts: Distribution = ZERO
+    """Amplitude of hum of the mains, the same in all channels of a pad."""
+    crosstalk: Distribution = ZERO
+    """Share of the channel converted before that a channel reads, one value per pad."""
+    nonlinearity_counts: Distribution = ZERO
+    """Amplitude of a channel's error by its converter's non-linearity."""
     zero_drift_counts_per_s: Distribution = ZERO
     """Maximum drift rate of a channel's zero, one value per hand; channels drift independently."""
     temperature_drift_k_per_s: Distribution = ZERO

@@ -1,7 +1,7 @@
 """World: distributions of all hidden quantities of a simulated hand, and draws from them.
 
-Public names: `World`; `DrawnWorld` (the world of one seed) with its records `HiddenPad`, `HiddenContact`,
-`HiddenJoints`.
+Public names: `World`; `DrawnWorld` (the world of one seed) with its records `HiddenPad`, `HiddenChannels`,
+`HiddenContact`, `HiddenJoints`.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from handtouch.simulate.worlds.spreads import (
 FloatArray = NDArray[np.float64]
 PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
+_ELONGATION_STD, _TILT_STD = 0.4, 0.3  # of contacts of all profiles, as a builder states it
 _MAX_ARC_GROWTH = 0.4  # growth at each end over the shortest bare stretch between electrodes on arcs
 UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
@@ -92,6 +93,16 @@ class HiddenPad:
     noise_ratio: float
     offset_counts_per_k: PerElectrode
     gain_per_k: PerElectrode
+
+
+@dataclass(frozen=True)
+class HiddenChannels:
+    """Errors of the channels of a pad, see `ElectronicsSpread`."""
+
+    crosstalk: float
+    nonlinearity_counts: PerElectrode
+    hum_counts: float
+    common_noise_counts: float
 
 
 @dataclass(frozen=True)
@@ -156,7 +167,7 @@ class DrawnWorld:
         mount = self._stream("mount", link)
         return HiddenPad(
             gain_ratio=_floats(gain),
-            series_ohm=_floats(np.array(pad.series_ohm) * resistors),
+            series_ohm=_floats(np.array(pad.series_ohm) * resistors + self.lead_ohm(link, count)),
             gap_before_mm=_floats(gaps[:count]),
             gap_after_mm=_floats(gaps[count:]),
             sheet_ohm_ratio=self._number(parts.sheet_ohm_ratio, "sheet_ohm", link),
@@ -246,14 +257,20 @@ class DrawnWorld:
         """Return the deployment as its builder writes it: with the nominal behaviour of the drawn kinds, and
         with the tolerances of his parts."""
         parts, law = self.world.parts, self.world.sheets
-        of_node = {"gain_std": parts.gain_ratio.std, "series_std": parts.resistor_ratio.std}
+        contacts, shapes = self.world.contacts, len(self.world.contacts.profile.names) > 1
+        of_node = {
+            "gain_std": parts.gain_ratio.std,
+            "series_std": parts.resistor_ratio.std,
+            "series_std_ohm": float(np.hypot(parts.lead_ohm.mean, parts.lead_ohm.std)),
+        }
         of_sheet = {
             "ohm_per_square_std": parts.sheet_ohm_ratio.std,
             "contact_ohm_std": law.contact_ohm_ratio.std,
             "alpha_std": law.alpha_offset.std,
             "anisotropy_std": parts.anisotropy_ratio.std,
             "unevenness_std": parts.unevenness.std,
-            "contact_elongation_std": float(np.log(self.world.contacts.elongation.mean)),
+            "contact_elongation_std": max(float(np.log(contacts.elongation.mean)), _ELONGATION_STD * shapes),
+            "contact_tilt_std": _TILT_STD * shapes,
             "gap_std_mm": parts.gap_offset_mm.std,
             "size_std_mm": max(parts.length_offset_mm.std, parts.width_offset_mm.std),
         }
@@ -265,6 +282,20 @@ class DrawnWorld:
         nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
         shears = {name: self.world.shear.describe(shear) for name, shear in deployment.shears.items()}
         return deployment.model_copy(update={"sheets": sheets, "nodes": nodes, "shears": shears})
+
+    def lead_ohm(self, pad_name: str, count: int = 4) -> FloatArray:
+        """Return the resistances (count,) of the leads of a pad's electrodes, "hand/link" [ohm]."""
+        return self._numbers(self.world.parts.lead_ohm, count, "lead_ohm", pad_name)
+
+    def channel_errors(self, pad_name: str, count: int = 4) -> HiddenChannels:
+        """Return the errors of the channels of a pad, "hand/link"."""
+        spread = self.world.electronics
+        return HiddenChannels(
+            self._number(spread.crosstalk, "crosstalk", pad_name),
+            _floats(self._numbers(spread.nonlinearity_counts, count, "nonlinearity_counts", pad_name)),
+            self._number(spread.hum_counts, "hum_counts", pad_name),
+            self._number(spread.common_noise_counts, "common_noise_counts", pad_name),
+        )
 
     def offset_counts_per_k(self, pad_name: str, count: int = 4) -> FloatArray:
         """Return the temperature coefficients (count,) of the zeros of a pad, "hand/link"."""

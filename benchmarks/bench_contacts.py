@@ -1,0 +1,290 @@
+"""Positions of real contacts: firm, tilted, uneven, and with what no file states.
+
+Hands of the world `default` ([worlds](../worlds.md)), seeds of the reporting family, 15 pads each, mounted as
+stated, through the daemon's own pipeline; one sample of each touch, 0.32 s after it began. The shipped file
+describes them, with the tolerances of parts of their builder. Touches of each pad are of seven profiles of
+pressure and four ranges of force, equally often, anywhere from 2 % of a side inside the edges, with the
+world's radii. The truth is the centre of the pressure that is on the pad. *Learned*: after automatic
+calibration by 56 more such contacts of each pad.
+
+*Disturbances*: evenly pressed round contacts of the same hands with one property more, or another one, which
+the file doesn't state. Errors and deviations in mm; intervals of shares by pads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.bench_worlds import DRAWN_MORE, DRAWN_PER_LEARNT, learn
+from benchmarks.hand_touches import (
+    REST_S,
+    STEP_S,
+    TOUCH_S,
+    TouchReadings,
+    compare,
+)
+from benchmarks.oracle import PadOracle
+from benchmarks.page import Report, options, progress
+from benchmarks.scores import ClusterShare, Estimates, EstimateScore, concatenate
+from handtouch.config import load, shipped
+from handtouch.core.pad_model import PadModel
+from handtouch.simulate.contact_patch import PROFILES
+from handtouch.simulate.faults import GainStep
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import (
+    WORLDS,
+    Family,
+    Fixed,
+    MountSpread,
+    Normal,
+    Uniform,
+    World,
+)
+
+FloatArray = NDArray[np.float64]
+FORCES_N = (0.15, 1.0, 2.0, 3.3, 5.0)
+SHAPES: dict[str, dict[str, Any]] = {
+    name: {"profile": name, "elongation": 1.0} for name in PROFILES
+} | {"ellipse 2:1": {"profile": "uniform", "elongation": 2.0}}  # fmt: skip
+ROUND = {"uniform": SHAPES["uniform"]}
+LEARNT = 56
+WARM_UP, QUIET = 4, 100
+"""Touches before those that are compared; times of touches without one before these, for noise to be
+measured."""
+CONFIGURED, LEARNED = "as configured", "learned"
+WORLD = replace(WORLDS["default"].with_sheets(), mounts=MountSpread())
+
+
+def parts(**changes: Any) -> World:
+    return replace(WORLD, parts=replace(WORLD.parts, **changes))
+
+
+def electronics(**changes: Any) -> World:
+    return replace(WORLD, electronics=replace(WORLD.electronics, **changes))
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What the hands of a row have besides their world."""
+
+    name: str
+    world: World = WORLD
+    gain_step: float = 1.0
+    """Factor of one channel's gain of each pad."""
+    beside: float = 0.0
+    """Share of the force that presses right beside the touch, as a film of water might conduct."""
+    over_edge: bool = False
+    """Touches over an edge."""
+    is_noise: bool = False
+    """Its noise is measured before."""
+
+
+DISTURBANCES = (
+    Disturbance("none"),
+    Disturbance("over an edge", over_edge=True),
+    *(
+        Disturbance(f"film uneven, waves of {100 * amplitude:g} %", parts(unevenness=Normal(0.0, amplitude)))
+        for amplitude in (0.02, 0.04)
+    ),
+    *(Disturbance(f"leads of 0 to {ohm:g} ohm", parts(lead_ohm=Uniform(0.0, ohm))) for ohm in (5, 10, 30)),
+    *(Disturbance(f"noise times {n:g}", electronics(noise_ratio=Fixed(n)), is_noise=True) for n in (3, 10)),
+    *(Disturbance(f"hum of {n:g} counts", electronics(hum_counts=Fixed(n)), is_noise=True) for n in (3, 10)),
+    Disturbance("common noise of 10 counts", electronics(common_noise_counts=Fixed(10.0)), is_noise=True),
+    *(
+        Disturbance(f"non-linearity of {n:g} counts", electronics(nonlinearity_counts=Normal(0.0, n)))
+        for n in (2, 8)
+    ),
+    Disturbance("crosstalk of 1 %", electronics(crosstalk=Fixed(0.01))),
+    *(Disturbance(f"one gain wrong by {100 * step:g} %", gain_step=1 + step) for step in (0.05, 0.1)),
+    Disturbance("water beside the contact, 10 %", beside=0.19),
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One hand of a row: its number, and touches of each pad in each shape and range of force."""
+
+    disturbance: Disturbance
+    shapes: Mapping[str, Mapping[str, Any]]
+    number: int
+    each: int
+    family: Family
+    learns: bool
+
+
+def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
+    """Return `count` touches of each pad, one after the other; shapes and forces follow each other."""
+    rng = np.random.default_rng((seed, 11))
+    shapes = list(task.shapes.values())
+    found = []
+    for number in range(QUIET if task.disturbance.is_noise else 0, count):
+        shape, low = shapes[number % len(shapes)], number // len(shapes) % 4
+        for link in links:
+            place = rng.uniform(0.02, 0.98, 2)
+            if task.disturbance.over_edge:
+                place[rng.integers(2)] = rng.uniform(0.02, 0.06)
+            force = np.exp(rng.uniform(*np.log(FORCES_N[low : low + 2])))
+            common = {
+                "link": link,
+                "from_s": REST_S + number * STEP_S,
+                "duration_s": TOUCH_S,
+                "direction_deg": rng.uniform(0.0, 360.0),
+                **shape,
+            }
+            wet = task.disturbance.beside
+            found.append(ScenarioTouch(path=(tuple(place),), force_n=((1 - wet) * force,), **common))
+            if wet:
+                aside = np.clip(place + np.where(place > 0.5, -0.06, 0.06), 0.02, 0.98)
+                found.append(ScenarioTouch(path=(tuple(aside),), force_n=(wet * force,), **common))
+    return tuple(found)
+
+
+def play(task: Task) -> dict[str, Estimates]:
+    """Return estimates of position and of force of a hand, in each state."""
+    drawn = task.disturbance.world.draw(task.family.seed(task.number))
+    builder = WORLD.draw(task.family.seed(task.number))
+    deployment = builder.describe(load(shipped.path("utah_mit.toml")))
+    model = PadModel(deployment)
+    first = WARM_UP + (QUIET if task.disturbance.is_noise else 0)
+    numbers = range(first, first + 4 * task.each * len(task.shapes))
+    more = round(DRAWN_PER_LEARNT * LEARNT) + DRAWN_MORE if task.learns else 0
+    others = range(numbers.stop, numbers.stop + more)
+    stimulus = Scenario(touch=draw_touches(task, model.links, others.stop, drawn.seed))
+    rng = np.random.default_rng((drawn.seed, 12))
+    step = task.disturbance.gain_step
+    faults = [
+        GainStep(link=link, from_s=0.0, electrode=("x0", "xa", "y0", "yb")[rng.integers(4)], factor=step)
+        for link in model.links
+        if step != 1
+    ]
+    hand = VirtualHand(deployment, stimulus, drawn, faults=faults)
+    readings = TouchReadings.of_hand(hand, deployment, numbers)
+    found: dict[str, list[Estimates]] = {"position": [], "force": []}
+    for state in (CONFIGURED, LEARNED) if task.learns else (CONFIGURED,):
+        if state == LEARNED:
+            for row in range(model.size):
+                if calibration := learn(hand, deployment, model, row, others, (LEARNT,))[0].calibration:
+                    model.set_calibration(row, calibration)
+        contacts = readings.contacts(model, deployment)
+        for row, (name, pad) in enumerate(deployment.pads):
+            keys = [(k, pad.link) for k in numbers if (k, pad.link) in readings.truths]
+            pairs = [(contacts.get(key), readings.truths[key]) for key in keys]
+            labels = {"state": state, "pad": f"{task.number}/{pad.link}"}
+            oracle = PadOracle.build(drawn, deployment, name, pad, model.noise_a[row])
+            position, force = compare(pairs, oracle, labels)
+            shapes = list(task.shapes)
+            cells = {
+                "shape": np.array([shapes[k % len(shapes)] for k, _ in keys]),
+                "range": np.array([k // len(shapes) % 4 for k, _ in keys]),
+            }
+            found["position"].append(with_columns(position, cells))
+            found["force"].append(with_columns(force, cells))
+    return {quantity: concatenate(some) for quantity, some in found.items()}
+
+
+def with_columns(estimates: Estimates, more: Mapping[str, NDArray[Any]]) -> Estimates:
+    return replace(estimates, columns={**estimates.columns, **more})
+
+
+def row_of(part: Estimates, scale: float = 1e3) -> dict[str, Any]:
+    """Return the cells of a row."""
+    valid = part.where(part.valid)
+    score = EstimateScore.of_estimates(part)
+    pads = valid.columns["pad"]
+    near = part.columns["edge distance"] == "1: below 5 %"
+    share: Callable[[NDArray[np.bool_]], Any] = lambda mask: (  # noqa: E731
+        ClusterShare.of_mask(mask, pads) if len(set(pads)) > 1 else "-"
+    )
+    return {
+        "touches": len(part),
+        "valid, %": 100 * part.valid.mean(),
+        "valid within 5 % of an edge, %": 100 * part.valid[near].mean() if near.any() else None,
+        "in 95 %": share(valid.stated_levels() <= 0.95),
+        "> 5 sigma, %": score.beyond_5_sigma,
+        "rms error": scale * score.rms_error,
+        "median std": scale * score.median_std,
+        "oracle": scale * score.oracle_std,
+    }
+
+
+def state_tables(report: Report, found: Mapping[str, Estimates]) -> None:
+    """Add the tables of profiles and ranges of force."""
+    for quantity, scale in (("position", 1e3), ("force", 1.0)):
+        every = found[quantity]
+        rows = []
+        for state in dict.fromkeys(every.columns["state"].tolist()):
+            of_state = every.where(every.columns["state"] == state)
+            rows.append({"case": f"{state}, all"} | row_of(of_state, scale))
+            for shape in dict.fromkeys(of_state.columns["shape"].tolist()):
+                own = of_state.where(of_state.columns["shape"] == shape)
+                for low in range(4):
+                    cell = own.where(own.columns["range"] == low)
+                    ends = f"{FORCES_N[low]:g} to {FORCES_N[low + 1]:g} N"
+                    rows.append({"case": f"{state}, {shape}, {ends}"} | row_of(cell, scale))
+        report.table(quantity.capitalize(), rows)
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--hands", type=int, default=6, help="of the profiles; half as many of disturbances")
+    parser.add_argument("--each", type=int, default=5, help="touches of a pad in each profile and range")
+    parser.add_argument("--tune", action="store_true", help="seeds of the tuning family; keeps no page")
+    parser.add_argument("--only", default="", help="profiles, or disturbances whose names contain this")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    asked = parser.parse_args()
+    if asked.quick:
+        asked.hands, asked.each = 1, 1
+    family = Family.TUNING if asked.tune else Family.REPORTING
+    profiles = [
+        Task(DISTURBANCES[0], SHAPES, number, asked.each, family, True)
+        for number in range(asked.hands if asked.only in ("", "profiles") else 0)
+    ]
+    disturbed = [
+        Task(one, ROUND, number, asked.each, family, one.gain_step != 1)
+        for one in DISTURBANCES
+        if asked.only in one.name
+        for number in range((asked.hands + 1) // 2)
+    ]
+    report = Report(
+        asked.quick or asked.tune or bool(asked.only), hands=asked.hands, touches_of_a_cell=asked.each
+    )
+    made = []
+    with ProcessPoolExecutor(asked.processes) as pool:
+        for task, result in zip(
+            (*profiles, *disturbed), pool.map(play, (*profiles, *disturbed)), strict=True
+        ):
+            progress(f"{task.disturbance.name}, hand {task.number + 1}")
+            made.append(result)
+    if profiles:
+        of_profiles = made[: len(profiles)]
+        state_tables(report, {q: concatenate([one[q] for one in of_profiles]) for q in ("position", "force")})
+    rows = []
+    for name in dict.fromkeys(task.disturbance.name for task in disturbed):
+        of_row = [
+            one["position"]
+            for task, one in zip(disturbed, made[len(profiles) :], strict=True)
+            if task.disturbance.name == name
+        ]
+        every = concatenate(of_row)
+        rows += [
+            {"case": f"{name}, {state}"} | row_of(every.where(every.columns["state"] == state))
+            for state in dict.fromkeys(every.columns["state"].tolist())
+        ]
+    if rows:
+        report.table("Disturbances", rows)
+    report.keep()
+
+
+if __name__ == "__main__":
+    main()
