@@ -36,7 +36,7 @@ from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import ClusterShare, Estimates, EstimateScore, concatenate
 from handtouch.config import load, shipped
-from handtouch.core.pad_model import PadModel
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.contact_patch import PROFILES
 from handtouch.simulate.faults import GainStep
 from handtouch.simulate.scenario import Scenario
@@ -155,7 +155,7 @@ def play(task: Task) -> dict[str, Estimates]:
     drawn = task.disturbance.world.draw(task.family.seed(task.number))
     builder = WORLD.draw(task.family.seed(task.number))
     deployment = builder.describe(load(shipped.path("utah_mit.toml")))
-    model = PadModel(deployment)
+    model = build_pad_model(deployment)
     first = WARM_UP + (QUIET if task.disturbance.is_noise else 0)
     numbers = range(first, first + 4 * task.each * len(task.shapes))
     more = round(DRAWN_PER_LEARNT * LEARNT) + DRAWN_MORE if task.learns else 0

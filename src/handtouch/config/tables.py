@@ -383,9 +383,9 @@ class Sheet(Table):
         description="error of a pad's gap_mm, each end of an electrode (1 sigma); default: that of +-0.2",
     )
     unevenness_std: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.02,
+        0.01,
         description="relative amplitude of each of the five longest waves of the sheet resistance over a pad "
-        "(1 sigma); a film of +-10 % has about 0.04; default: that of +-5 %",
+        "(1 sigma); a film of +-10 % has about 0.04; default: that of +-2.5 %",
     )
     size_std_mm: NonNegative = Field(
         0.06, description="error of a pad's length and width (1 sigma); default: that of +-0.1"

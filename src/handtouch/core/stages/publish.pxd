@@ -30,7 +30,7 @@ cdef Py_ssize_t _published_index(ContactColumns columns, Py_ssize_t pad, Py_ssiz
 @cython.locals(i=Py_ssize_t, finite=bint)
 cdef bint _are_finite(double[::1] values, Py_ssize_t first, Py_ssize_t count) noexcept
 @cython.locals(values='double[::1]', first=Py_ssize_t, i=Py_ssize_t, at=Py_ssize_t, value=double, located=bint, has_mount=bint,
-               no_point=bint, position=Py_ssize_t, force=Py_ssize_t)
+               no_point=bint, is_odd=bint, position=Py_ssize_t, force=Py_ssize_t)
 cdef void _publish_contact(ContactColumns columns, Py_ssize_t pad) noexcept
 
 cdef class ContactEncoder:

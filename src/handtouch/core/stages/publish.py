@@ -149,7 +149,8 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
             force = _FORCE_LOWER_BOUND
         elif not columns.known[pad] or columns.reliability[pad] == _EVIDENCE_MISSING:
             force = _FORCE_UNRELIABLE
-        if force == _FORCE_VALID and values[first + _ESTIMATE] == _WIDE_ESTIMATE:
+        is_odd = values[first + _ESTIMATE] == _WIDE_ESTIMATE or values[first + _MISFIT] > _MAX_SQUARED_MISFIT
+        if force == _FORCE_VALID and is_odd:
             force = _FORCE_UNRELIABLE
     columns.force_status[pad] = force
     if value == value and not columns.peak_force_n[pad] >= value:

@@ -28,11 +28,12 @@ class PadTolerances:
     tilt_std: rise of a contact's pressure to its rim, over its mean, along any direction; moment_std:
     relative difference of its second moment along any direction from that of a round one. middle_u_m: arc
     length from the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its
-    sides. elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies derivatives
-    by x x and x y with. overhangs: (k,) root mean square shift [m] of positions from an edge that an
-    elongated contact hangs over, at multiples of `overhang_step_m` from it. states: of a schedule, 1 without
-    one; state_of: (n,) state in which each electrode is measured; state_std, state_std_per_a: of the
-    logarithm of a contact's current in each, by its force, and per ampere by the electrodes that it sees.
+    sides. elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies
+    derivatives by x x and x y with. overhangs: (k,) root mean square shift [m] of positions from an edge
+    that an elongated contact hangs over, at multiples of `overhang_step_m` from it. states: of a schedule,
+    1 without one; state_of: (n,) state in which each electrode is measured; state_std, state_std_per_a: of
+    the logarithm of a contact's current in each, by its force, and per ampere by the electrodes that it
+    sees.
     """
 
     def __init__(

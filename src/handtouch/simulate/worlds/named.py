@@ -39,7 +39,6 @@ _DEFAULT = World(
         lead_ohm=Uniform(0.0, 2.0),
         sheet_ohm_ratio=LogNormal(1.0, 0.1),
         anisotropy_ratio=LogNormal(1.0, 0.02),
-        unevenness=Normal(0.0, 0.02),
         length_offset_mm=Uniform(-0.1, 0.1),
         width_offset_mm=Uniform(-0.1, 0.1),
     ),

@@ -33,7 +33,8 @@ from handtouch.simulate.worlds.spreads import (
 FloatArray = NDArray[np.float64]
 PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
-_ELONGATION_STD, _TILT_STD = 0.4, 0.3  # of contacts of all profiles, as a builder states it
+_UNEVENNESS_STD, _ELONGATION_STD, _TILT_STD = 0.01, 0.4, 0.3
+"""Of films and contacts, as builders state them who know of all profiles and haven't measured the film."""
 _MAX_ARC_GROWTH = 0.4  # growth at each end over the shortest bare stretch between electrodes on arcs
 UNEVEN_MODES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (m, n), cos(m pi x) cos(n pi y), of the logarithm of an uneven sheet's resistance."""
@@ -257,7 +258,7 @@ class DrawnWorld:
         """Return the deployment as its builder writes it: with the nominal behaviour of the drawn kinds, and
         with the tolerances of his parts."""
         parts, law = self.world.parts, self.world.sheets
-        contacts, shapes = self.world.contacts, len(self.world.contacts.profile.names) > 1
+        contacts, careful = self.world.contacts, len(self.world.contacts.profile.names) > 1
         of_node = {
             "gain_std": parts.gain_ratio.std,
             "series_std": parts.resistor_ratio.std,
@@ -268,9 +269,9 @@ class DrawnWorld:
             "contact_ohm_std": law.contact_ohm_ratio.std,
             "alpha_std": law.alpha_offset.std,
             "anisotropy_std": parts.anisotropy_ratio.std,
-            "unevenness_std": parts.unevenness.std,
-            "contact_elongation_std": max(float(np.log(contacts.elongation.mean)), _ELONGATION_STD * shapes),
-            "contact_tilt_std": _TILT_STD * shapes,
+            "unevenness_std": max(parts.unevenness.std, _UNEVENNESS_STD * careful),
+            "contact_elongation_std": max(float(np.log(contacts.elongation.mean)), _ELONGATION_STD * careful),
+            "contact_tilt_std": _TILT_STD * careful,
             "gap_std_mm": parts.gap_offset_mm.std,
             "size_std_mm": max(parts.length_offset_mm.std, parts.width_offset_mm.std),
         }
