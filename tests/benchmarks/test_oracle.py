@@ -24,6 +24,7 @@ from handtouch.simulate.worlds import (
     ContactSpread,
     DrawnWorld,
     Family,
+    Fixed,
     MountSpread,
     Normal,
     PartSpread,
@@ -33,9 +34,13 @@ from handtouch.simulate.worlds import (
 
 PLACES = ((0.5, 0.5), (0.2, 0.7), (0.65, 0.35))
 FORCE_N = 2.0
+LIGHT_N = 0.3  # whose current is even, as the oracle has it
 
 
-EVEN = {"crowding": False, "contact_elongation_std": 0.0, "unevenness_std": 0.0}
+EVEN = {
+    "crowding": False,
+    **dict.fromkeys(("contact_elongation_std", "contact_tilt_std", "unevenness_std"), 0.0),
+}
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +50,9 @@ def deployment() -> config.Deployment:
     (hand,) = whole.hands
     pads = tuple(pad for pad in hand.pads if pad.link == "index_distal")
     sheets = {name: sheet.model_copy(update=EVEN) for name, sheet in whole.sheets.items()}
-    return whole.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),), "sheets": sheets})
+    nodes = {name: node.model_copy(update={"series_std_ohm": 0.0}) for name, node in whole.nodes.items()}
+    hands = (hand.model_copy(update={"pads": pads}),)
+    return whole.model_copy(update={"hands": hands, "sheets": sheets, "nodes": nodes})
 
 
 def world(parts: PartSpread, contacts: ContactSpread | None = None) -> DrawnWorld:
@@ -53,9 +60,9 @@ def world(parts: PartSpread, contacts: ContactSpread | None = None) -> DrawnWorl
     return made.draw(Family.TUNING.seed(3))
 
 
-def truths(deployment: config.Deployment, drawn: DrawnWorld) -> list[GroundTruth]:
+def truths(deployment: config.Deployment, drawn: DrawnWorld, force_n: float = FORCE_N) -> list[GroundTruth]:
     touches = tuple(
-        ScenarioTouch(link="index_distal", from_s=k * 1.0, duration_s=0.9, path=(place,), force_n=(FORCE_N,))
+        ScenarioTouch(link="index_distal", from_s=k * 1.0, duration_s=0.9, path=(place,), force_n=(force_n,))
         for k, place in enumerate(PLACES)
     )
     hand = VirtualHand(deployment, Scenario(touch=touches), drawn)
@@ -74,13 +81,13 @@ def covariances(
         at_m = oracle.surface.from_rectangle(*(size * place))
         oracle = oracle.with_contacts(np.stack([*at_m, np.full(contacts_before, FORCE_N)]), noise_a)
     u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
-    return oracle.covariances(u, v, np.full(len(found), FORCE_N))
+    return oracle.covariances(u, v, np.array([truth.force_n for truth in found]))
 
 
 def test_without_hidden_quantities_it_is_the_simulators_own_bound(deployment: config.Deployment) -> None:
     """Electrodes and sheet as configured; the bound is of finite elements, the oracle of the theory."""
     drawn = world(PartSpread())
-    found = truths(deployment, drawn)
+    found = truths(deployment, drawn, LIGHT_N)
     stated = covariances(deployment, drawn, found)
     rms_m = np.sqrt(np.trace(stated.position_m2, axis1=1, axis2=2))
     assert rms_m == pytest.approx([truth.bound_m for truth in found], rel=0.02)
@@ -90,7 +97,7 @@ def test_without_hidden_quantities_it_is_the_simulators_own_bound(deployment: co
 def test_it_evaluates_at_the_true_parts(deployment: config.Deployment) -> None:
     """Wider gaps on one side than the file says change the bound as in the simulator."""
     drawn = world(PartSpread(gap_offset_mm=Uniform(0.0, 1.5)))
-    found = truths(deployment, drawn)
+    found = truths(deployment, drawn, LIGHT_N)
     ((hand, pad),) = deployment.pads
     known = replace(drawn, world=World("known"))
     oracle = PadOracle(
@@ -98,7 +105,7 @@ def test_it_evaluates_at_the_true_parts(deployment: config.Deployment) -> None:
         build_pad_model(deployment).noise_a[0], {},
     )  # fmt: skip
     u, v = np.array([(truth.u_m, truth.v_m) for truth in found]).T
-    stated = oracle.covariances(u, v, np.full(len(found), FORCE_N))
+    stated = oracle.covariances(u, v, np.full(len(found), LIGHT_N))
     rms_m = np.sqrt(np.trace(stated.position_m2, axis1=1, axis2=2))
     assert rms_m == pytest.approx([truth.bound_m for truth in found], rel=0.02)
     nominal = covariances(deployment, known, found)
@@ -153,7 +160,14 @@ def test_a_hidden_radius_widens_forces_up_to_what_the_contact_layer_alone_would(
 
 def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment: config.Deployment) -> None:
     """Median of the stated standard deviations, by the oracle's that got the same contacts."""
-    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.TUNING.seed(4))
+    default = WORLDS["default"]
+    even = replace(
+        default,
+        mounts=MountSpread(),
+        parts=replace(default.parts, lead_ohm=Fixed(0.0)),
+        contacts=ContactSpread(radius_sigma=Normal(0.0, 1.0)),
+    )
+    drawn = even.draw(Family.TUNING.seed(4))
     described = drawn.describe(deployment)
     ((hand_name, pad),) = described.pads
     model, touches = build_pad_model(described), draw_touches(["index_distal"], 80, drawn.seed)

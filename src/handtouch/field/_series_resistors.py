@@ -98,9 +98,11 @@ class GroundedElectrodes(ABC):
 
         0 where electrodes touch: any resistance between them makes the currents of both unknown.
         """
-        if not np.isfinite(self.conductance).all():
+        try:
+            conductance = self.conductance
+        except ValueError:
             return np.zeros_like(self._mix)
-        return np.asarray(-self._mix @ self.conductance / self.sheet_ohm_per_square)
+        return np.asarray(-self._mix @ conductance / self.sheet_ohm_per_square)
 
     @property
     def currents_per_ideal(self) -> FloatArray:

@@ -146,7 +146,12 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
 
 
 def series_ohm_stds(pad: config.Pad, node: config.Node) -> NDArray[np.float64]:
-    """Return the standard deviations of the resistances from a pad's electrodes to ground, (c,) [ohm]."""
+    """Return the standard deviations of the resistances from a pad's electrodes to ground, (c,) [ohm].
+
+    0 where electrodes touch.
+    """
+    if not np.min(pad.gaps_mm) > 0:
+        return np.zeros(len(pad.electrode_names))
     return np.hypot(node.series_std * np.array(pad.series_ohm), node.series_std_ohm)
 
 
