@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from typing import Any, cast
 
-from lerobot.robots import Robot, make_robot_from_config
+import draccus
+from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
 from handtouch import Hand
 from handtouch.learn import TouchFeatures
@@ -28,7 +29,7 @@ class Handtouch(Robot):
     def __init__(self, config: HandtouchConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.robot = make_robot_from_config(config.robot)
+        self.robot = make_robot_from_config(draccus.decode(RobotConfig, dict(config.robot)))
         self.touch = TouchFeatures(config.links, frame=cast(Any, config.frame), vector=config.vector)
         self._hand: Hand | None = None
 

@@ -1,4 +1,4 @@
-"""A simulated arm of one joint, as a robot of LeRobot's."""
+"""A simulated arm of one joint, as a robot of LeRobot's, which looks for `Arm` in this module by its name."""
 
 from __future__ import annotations
 
