@@ -150,7 +150,7 @@ def test_commands_take_a_key_by_option_and_by_environment(reachable: Reachable) 
     assert '"pads"' in printed, printed
     status, printed = reachable.call("tare", *control, HANDTOUCH_KEY=reader)
     assert status == 1
-    assert 'needs "control"' in printed
+    assert 'tare: this key has the right "read"; the command needs "control"' in printed
     status, printed = reachable.call("watch", "service", *live, "--key", reader, "--seconds", "3")
     assert status == 0, printed
     status, printed = reachable.call("watch", "service", *live, "--seconds", "60")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,8 @@ from handtouch.config import ConfigError, load
 from handtouch.core.link_poses import LinkPoses
 from handtouch.hand.robot_models import RobotModels, check_urdfs, unchecked_items
 
-TEXT = (Path(__file__).parents[2] / "docs" / "hand.md").read_text()
+DOCS = Path(__file__).parents[2] / "docs"
+TEXT = (DOCS / "hand.md").read_text()
 
 
 def written(folder: Path, allegro: Path) -> Path:
@@ -41,6 +45,20 @@ def test_documented_example_fits_the_hand(
     assert straight.translation_m[2] == pytest.approx(0.1355 * math.cos(math.radians(5)) - 0.0015, abs=1e-4)
     poses.set_joint_positions(np.array([0.0, 1.0, 1.0, 1.0]))
     assert poses.pose_in_palm(2).translation_m[0] > 0.04  # it closes towards the palm's side, x
+
+
+@pytest.mark.usefixtures("allegro")
+def test_the_how_to_s_commands_find_the_urdf_and_all_its_meshes(tmp_path: Path) -> None:
+    written(tmp_path, Path("allegro_right_hand.urdf")).rename(tmp_path / "allegro.toml")
+    section = (DOCS / "howto.md").read_text().partition("## ... equip an Allegro hand")[2]
+    _install, *commands = section.split("```")[1].strip().splitlines()
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    script = "\n".join(["set -e", *commands])
+    done = subprocess.run(
+        ["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "no warnings" in done.stdout
 
 
 def test_pad_facing_into_the_hand_is_reported(tmp_path: Path, allegro: Path) -> None:

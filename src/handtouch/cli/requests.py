@@ -120,8 +120,8 @@ def send_request(command: str, endpoint: str, key: str | None, **arguments: Any)
     """Return the daemon's answer to a request; errors end the command."""
     with failing(2, ValueError), failing(1, OSError, RuntimeError):
         timeout_s = SHORT_TIMEOUT_S
-        if command in SLOW_COMMANDS:  # report a missing daemon without the long timeout
-            request("scene", endpoint=endpoint, key=key, timeout_s=timeout_s)
+        if command in SLOW_COMMANDS:  # report a missing daemon without the long timeout; any key may ask this
+            request("status", endpoint=endpoint, key=key, timeout_s=timeout_s)
             timeout_s = LONG_TIMEOUT_S
         return request(command, endpoint=endpoint, key=key, timeout_s=timeout_s, **arguments)
 

@@ -159,7 +159,10 @@ def _place_of_mesh(file: str, folder: Path) -> str:
     """Return where a mesh is searched."""
     if file.startswith("package://"):
         package = file.removeprefix("package://").partition("/")[0]
-        return f"put the folder {package} of its ROS package into {folder.resolve()}, or a folder above it"
+        return (
+            f"put the folder {package} of its ROS package into {folder.resolve()} or a folder above it, "
+            "or its folder into ROS_PACKAGE_PATH"
+        )
     return f"paths are relative to the URDF's folder, {folder.resolve()}"
 
 
