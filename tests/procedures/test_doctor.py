@@ -7,10 +7,12 @@ import json
 import socket
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
 import zmq
 
@@ -117,8 +119,29 @@ def test_port_in_use_is_detected() -> None:
         port = taken.getsockname()[1]
         checks = list(doctor.check_endpoints(config.Daemon(live=f"tcp://127.0.0.1:{port}")))
     assert checks[0].state == "fail"
-    assert "address already in use" in checks[0].detail
+    assert "is in use" in checks[0].detail
     assert "handtouch status" in checks[0].remedy
+
+
+@pytest.mark.parametrize(("hands", "state"), [(None, "ok"), (["right"], "ok"), (["left"], "fail")])
+def test_endpoints_of_a_running_daemon_of_these_hands_are_ok(hands: list[str] | None, state: str) -> None:
+    with zmq.Context() as context, context.socket(zmq.REP) as control, context.socket(zmq.PUB) as live:
+        daemon = config.Daemon(
+            control=f"tcp://127.0.0.1:{control.bind_to_random_port('tcp://127.0.0.1')}",
+            live=f"tcp://127.0.0.1:{live.bind_to_random_port('tcp://127.0.0.1')}",
+        )
+
+        def answer() -> None:
+            control.recv()
+            control.send(msgpack.packb({"ok": True, "service": {"pid": 4711, "hands": {"right": ["tip"]}}}))
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        found = {check.subject: check for check in doctor.check_endpoints(daemon, hands)}
+        thread.join()
+    for name in ("live", "control"):
+        assert found[f"endpoint {name}"].state == state
+        assert ("process 4711" in found[f"endpoint {name}"].detail) is (state == "ok")
 
 
 @pytest.mark.parametrize(("host", "state"), [("*", "ok"), ("lo", "ok"), ("no-such0", "fail")])

@@ -317,6 +317,23 @@ def test_events_use_the_height_that_the_pads_leave(height: int) -> None:
     assert "#59 begins" in lines[-2]
 
 
+def test_only_whole_events_are_shown() -> None:
+    view = _view(HEALTH, replace(HEALTH, node_state="stale", reason="a long reason " * 20))
+    page = _page(view, width=80, height=7)
+    assert "stale: a long" in page  # the newest one, cut
+    view.update(replace(CONTACT, id=60))
+    lines = _page(view, width=80, height=8).splitlines()
+    assert sum("reason" in line for line in lines) == 0
+    assert any("#60 begins" in line for line in lines)
+
+
+def test_pads_are_in_the_order_of_the_hand() -> None:
+    links = ["thumb_tip", "index_tip", "palm"]
+    pads = [replace(HEALTH, link=link) for link in sorted(links)]
+    page = _page(_view(*pads, replace(SERVICE, hands={"right": links})))
+    assert [page.index(link) for link in links] == sorted(page.index(link) for link in links)
+
+
 def test_touched_pads_come_first_in_a_small_terminal() -> None:
     page = _page(_hand(40, 3), width=100, height=20)
     assert all(f"middle_proximal_{k} " in page for k in (37, 38, 39))

@@ -13,7 +13,7 @@ import platform
 import re
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,10 +22,11 @@ import zmq
 
 from handtouch import config
 from handtouch.canbus.bus.receivers import RECEIVE_BUFFER_BYTES
-from handtouch.client import keys
+from handtouch.client import keys, request
 from handtouch.config.checks import UDP_MULTICAST_PORT
 from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
+from handtouch.host.endpoints import to_connect
 from handtouch.host.installation import compile_command, extra_command
 from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
@@ -33,6 +34,9 @@ CheckState = Literal["ok", "warn", "fail"]
 _ENDPOINT_IN_USE_REMEDY = (
     "stop the daemon that uses it (`handtouch status`), or choose another endpoint in [daemon]"
 )
+_NO_ADDRESS_REMEDY = "name an address or interface of this machine in [daemon] (`ip -br address` lists them)"
+_DAEMON_TIMEOUT_S = 0.5
+"""Time for a running daemon to answer; it takes milliseconds"""
 FAST_CLOCK_SOURCES = ("tsc", "arch_sys_counter", "kvm-clock")
 
 
@@ -55,7 +59,8 @@ def check_host(deployment: config.Deployment | None, machine: Machine | None = N
     yield from check_receive_buffer(machine)
     for bus in deployment.buses if deployment else ():
         yield from check_bus(bus, machine)
-    yield from check_endpoints(deployment.daemon if deployment else config.Daemon())
+    hands = {hand.name for hand in deployment.hands} if deployment else None
+    yield from check_endpoints(deployment.daemon if deployment else config.Daemon(), hands)
     yield from check_keys(deployment.daemon if deployment else config.Daemon())
     yield from check_realtime(deployment.daemon if deployment else config.Daemon())
 
@@ -177,17 +182,50 @@ def check_bus(bus: config.Bus, machine: Machine) -> Iterator[HostCheck]:
         yield HostCheck(subject, "ok", f"{bus.interface} {bus.channel}: not checked")
 
 
-def check_endpoints(daemon: config.Daemon) -> Iterator[HostCheck]:
-    """Check that the daemon can bind its endpoints."""
+def check_endpoints(daemon: config.Daemon, hands: Collection[str] | None = None) -> Iterator[HostCheck]:
+    """Check that the daemon can bind its endpoints, or that it is a running daemon of these hands that has.
+
+    `hands`: names, None: any.
+    """
+    running: str | None = None
     for name in ("live", "complete", "control", "inputs"):
         endpoint = getattr(daemon, name)
         subject = f"endpoint {name}"
-        if endpoint.startswith("ipc://"):
-            yield _check_ipc_endpoint(subject, Path(endpoint.removeprefix("ipc://")))
-        elif problem := _bind_problem(endpoint):
-            yield HostCheck(subject, "fail", f"{endpoint}: {problem}", _ENDPOINT_IN_USE_REMEDY)
-        else:
-            yield HostCheck(subject, "ok", f"{endpoint} is free")
+        check = (
+            _check_ipc_endpoint(subject, Path(endpoint.removeprefix("ipc://")))
+            if endpoint.startswith("ipc://")
+            else _check_tcp_endpoint(subject, endpoint)
+        )
+        if check.remedy == _ENDPOINT_IN_USE_REMEDY:
+            running = _running_daemon(daemon, hands) if running is None else running
+            if running:
+                check = HostCheck(subject, "ok", f"{endpoint} is used by {running}")
+        yield check
+
+
+def _running_daemon(daemon: config.Daemon, hands: Collection[str] | None) -> str:
+    """Return which daemon of these hands answers at the control endpoint, empty if none does."""
+    try:
+        answer = request("status", endpoint=to_connect(daemon.control), timeout_s=_DAEMON_TIMEOUT_S)
+        service = answer["service"]
+        known = hands is None or set(service["hands"]) == set(hands)
+        return f"the running daemon, process {service['pid']}" if known else ""
+    except PermissionError:  # it runs, and requires a key that only its clients have
+        return "a running daemon that requires a key"
+    except (TimeoutError, ValueError, RuntimeError, KeyError):
+        return ""
+
+
+def _check_tcp_endpoint(subject: str, endpoint: str) -> HostCheck:
+    with zmq.Context() as context, context.socket(zmq.PUB) as probe:
+        try:
+            probe.bind(endpoint)  # accepts interface names too
+        except zmq.ZMQError as error:
+            if error.errno == zmq.EADDRINUSE:
+                return HostCheck(subject, "fail", f"{endpoint} is in use", _ENDPOINT_IN_USE_REMEDY)
+            problem = os.strerror(error.errno or 0).lower()
+            return HostCheck(subject, "fail", f"{endpoint}: {problem}", _NO_ADDRESS_REMEDY)
+    return HostCheck(subject, "ok", f"{endpoint} is free")
 
 
 def _check_socketcan(subject: str, bus: config.Bus, machine: Machine) -> Iterator[HostCheck]:
@@ -297,12 +335,3 @@ def _check_ipc_endpoint(subject: str, path: Path) -> HostCheck:
             subject, "fail", f"{folder} is not writable", f"give this user write permission: ls -ld {folder}"
         )
     return HostCheck(subject, "ok", f"ipc://{path} is free")
-
-
-def _bind_problem(endpoint: str) -> str | None:
-    with zmq.Context() as context, context.socket(zmq.PUB) as probe:
-        try:
-            probe.bind(endpoint)  # accepts interface names too
-        except zmq.ZMQError as error:
-            return str(error.strerror).lower()
-    return None

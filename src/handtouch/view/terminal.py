@@ -147,13 +147,14 @@ class HandView:
             self._events.append(_Event(pad.t_ns, [name], text, _STYLE_OF_STATE.get(state, "")))
 
     def _event_lines(self, console: Console, width: int, rows: int) -> list[Text]:
-        """Return the lines of the newest events, the oldest of them cut at the top."""
+        """Return the lines of the newest events that fit; the newest one is cut where it doesn't."""
         lines: list[Text] = []
         for event in reversed(self._events):
-            if len(lines) >= rows:
+            more = event.lines(console, width)
+            if lines and len(lines) + len(more) > rows:
                 break
-            lines = event.lines(console, width) + lines
-        return lines[max(0, len(lines) - rows) :]
+            lines = more + lines
+        return lines[:rows]
 
     def _name(self, pad: wire.Health | wire.Contact) -> str:
         """Return the link, with its hand if there are several."""
@@ -197,7 +198,9 @@ class HandView:
 
     def _table(self, width: int, free_rows: int) -> Table:
         names = {key: self._name(health) for key, health in self._health.items()}
-        shown = list(self._health)
+        hands = self._service.hands if self._service else {}
+        order = {(hand, link): row for hand, links in hands.items() for row, link in enumerate(links)}
+        shown = sorted(self._health, key=lambda key: (key[0], order.get(key, len(order))))
         if len(shown) > free_rows:  # pads with a contact or a fault first
             first = [k for k in shown if k in self._contacts or self._health[k].state not in _OK_STATES]
             shown = (first + [key for key in shown if key not in first])[: max(0, free_rows - 1)]
