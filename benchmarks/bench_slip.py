@@ -32,6 +32,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,7 +117,7 @@ def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
 
 
 def run(
-    grips: list[GripTouch],
+    grips: Sequence[GripTouch],
     world: DrawnWorld,
     hz: float,
     seconds: float,
@@ -391,11 +392,11 @@ def ramped(force_ramp_s: float, quick: bool) -> dict[str, Any]:
     grips = []
     for number, (link, size_mm) in enumerate(PADS):
         force = RAMPED_FORCES[number % len(RAMPED_FORCES)]
-        settings = {"ripple": 0.035, "sway_mm": 0.012, "force_ramp_s": force_ramp_s, "seed": 1100 + number}
+        settings: dict[str, Any] = {"ripple": 0.035, "sway_mm": 0.012, "seed": 1100 + number}
         grips.append(
             RampedGrip(
                 link=link, size_mm=size_mm, from_s=GRIPPED_S, duration_s=seconds + 1, path=((0.5, 0.5),),
-                force_n=(force,), roll_mm_per_n=0.0, **settings,
+                force_n=(force,), roll_mm_per_n=0.0, force_ramp_s=force_ramp_s, **settings,
             )
         )  # fmt: skip
     held = run(grips, world, 200.0, seconds)

@@ -13,7 +13,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from handtouch import config
 from handtouch.field import Rectangle
-from handtouch.simulate.contact_patch import PROFILES, ContactPatch
+from handtouch.simulate.contact_patch import PROFILES, ContactPatch, Profile
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMapBank, solve_sheet
@@ -38,7 +38,7 @@ def unit_pressure(profile: str, x: FloatArray, y: FloatArray) -> FloatArray:
     r = np.hypot(x, y)
     on = r < 1
     if profile == "hertz":
-        return np.sqrt(np.maximum(1 - r**2, 0))
+        return np.asarray(np.sqrt(np.maximum(1 - r**2, 0)))
     if profile == "ring":
         return np.asarray(on & (r > 0.6), np.float64)
     if profile == "two_spots":
@@ -113,7 +113,7 @@ def solve_reduced(
 @pytest.mark.parametrize("place", list(PLACES))
 @pytest.mark.parametrize("profile", PROFILES)
 def test_contacts_are_those_of_finite_volumes(
-    plane: tuple[SimulatedSurface, SheetMapBank], profile: str, place: str
+    plane: tuple[SimulatedSurface, SheetMapBank], profile: Profile, place: str
 ) -> None:
     elongation = 1.5 if profile in ("uniform", "tilted") else 1.0
     patch = ContactPatch(1e-3 * RADIUS_MM, elongation, 0.4, profile)

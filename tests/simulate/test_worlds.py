@@ -241,6 +241,7 @@ def test_harsh_is_two_to_three_times_as_wide_as_default() -> None:
     for name, distribution in default.items():
         wide = harsh[name]
         if isinstance(distribution, OneOf):
+            assert isinstance(wide, OneOf)
             assert set(wide.names) >= set(distribution.names)
             continue
         if isinstance(distribution, Fixed):  # noise, delay and rates

@@ -126,8 +126,8 @@ def models_with_other_parts(
     models += [nominal.with_moved_end(end, step) for end, step in enumerate(steps.tolist())]
     models.append(nominal.stretched(math.exp(log_aspect_std(pad, sheet))))
     models += [UnevenSheet(nominal, wave, sheet.unevenness_std) for wave in range(len(UNEVEN_WAVES))]
-    models += [nominal.with_series_ohm(ohm + more) for more in np.diag(series_ohm_stds(pad, node))]
-    models.append(nominal.with_series_ohm(ohm * math.exp(-sheet.ohm_per_square_std)))
+    models += [nominal.with_series_ohm((ohm + more).tolist()) for more in np.diag(series_ohm_stds(pad, node))]
+    models.append(nominal.with_series_ohm((ohm * math.exp(-sheet.ohm_per_square_std)).tolist()))
     return tuple(model if std else nominal for model, std in zip(models, stds, strict=True))
 
 
