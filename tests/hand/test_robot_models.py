@@ -347,7 +347,13 @@ def test_the_proposed_mount_is_on_the_body_and_faces_outward(tmp_path: Path, mou
         check_urdfs(changed(tmp_path, (MOUNT, f"mount = {mount}")), "hand.toml")
     found = re.search(r"nearest place is (position_mm = \[.*?\]), (rpy_deg = \[.*?\])", str(raised.value))
     assert found is not None
+    assert "-0.0" not in found[0]
     check_urdfs(changed(tmp_path, (MOUNT, f"mount = {{ {found[1]}, {found[2]} }}")), "hand.toml")
+
+
+def test_a_mount_that_is_not_given_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mount: isn't given.*origin of its link.*state position_mm"):
+        check_urdfs(changed(tmp_path, (MOUNT, "")), "hand.toml")
 
 
 def test_pad_may_lie_on_the_visible_surface_or_on_the_collision_body(tmp_path: Path) -> None:

@@ -248,25 +248,25 @@ def _mount_problems(
         return  # the URDF has no body for this link
     body = f'the body of link "{link}"'
     if height < -_MAX_PAD_DEPTH_M:
-        yield Problem(
-            f"{at}mount.position_mm",
-            _value_text(pad.mount.position_mm),
-            f"the pad's centre is {-height * 1e3:.1f} mm inside {body}; move it to the surface"
-            + _nearest_mount(rotation, middle, shapes, folder),
-        )
+        key, problem = "position_mm", f"the pad's centre is {-height * 1e3:.1f} mm inside {body}"
+        remedy = "move it to the surface"
     elif height > _MAX_PAD_HEIGHT_M:
-        yield Problem(
-            f"{at}mount.position_mm",
-            _value_text(pad.mount.position_mm),
-            f"the pad's centre is {height * 1e3:.1f} mm from {body}; is it on another link, or in metres?"
-            + _nearest_mount(rotation, middle, shapes, folder),
-        )
+        key, problem = "position_mm", f"the pad's centre is {height * 1e3:.1f} mm from {body}"
+        remedy = "is it on another link, or in metres?"
     elif outward_height <= height:
+        key, problem, remedy = "rpy_deg", f"the pad faces into {body}", "its z axis points outward"
+    else:
+        return
+    nearest = _nearest_mount(rotation, middle, shapes, folder)
+    if pad.mount.model_fields_set & {"position_mm", "rpy_deg"}:
+        given = _value_text(getattr(pad.mount, key))
+        yield Problem(f"{at}mount.{key}", given, f"{problem}; {remedy}{nearest}")
+    else:
         yield Problem(
-            f"{at}mount.rpy_deg",
-            _value_text(pad.mount.rpy_deg),
-            f"the pad faces into {body}; its z axis points outward"
-            + _nearest_mount(rotation, middle, shapes, folder),
+            f"{at}mount",
+            "",
+            f"isn't given, so the pad lies at the origin of its link, where {problem}; "
+            f"state position_mm of its centre and rpy_deg, z outward{nearest}",
         )
 
 
@@ -295,8 +295,9 @@ def _nearest_mount(
     x /= np.linalg.norm(x)
     y = np.cross(z, x)
     rpy = np.arctan2(y[2], z[2]), -np.arcsin(np.clip(x[2], -1, 1)), np.arctan2(x[1], x[0])
-    position_mm = (1e3 * point).round(1).tolist()
-    return f"; the nearest place is position_mm = {position_mm}, rpy_deg = {np.rad2deg(rpy).round().tolist()}"
+    position_mm = ((1e3 * point).round(1) + 0.0).tolist()
+    rpy_deg = (np.rad2deg(rpy).round() + 0.0).tolist()  # + 0.0: without a sign of zero
+    return f"; the nearest place is position_mm = {position_mm}, rpy_deg = {rpy_deg}"
 
 
 def _no_such(what: str, name: str, known: Sequence[str]) -> str:

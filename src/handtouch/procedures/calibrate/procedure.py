@@ -95,7 +95,7 @@ class WeightProcedure(GuidedProcedure[PadSample]):
                 else:
                     skipped.add(weight)
         except DialogueCancelled:  # quit; skip and again are handled per weight
-            self.print_line("Quit; the readings so far are kept.")
+            self.print_line("Quit; the readings so far are kept." if self.readings else "Quit.")
 
     def confirm(self, question: str) -> bool:
         """Return whether the operator confirms with Enter."""
