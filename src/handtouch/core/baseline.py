@@ -182,7 +182,8 @@ class Baseline:
         total = mean @ self._ones
         self._update_disturbance(elapsed_ns * 1e-9)
         mean_std = self._channel_noise / np.sqrt(np.maximum(self._count, 1.0))[:, None]
-        whole = self._count >= self._span_count  # no sample is left out that may have been above a threshold
+        # hum of which the samples above a threshold were left out
+        whole = ~self._swings() | (self._count >= self._span_count)
         falls = whole & self._falls(mean, mean_std)
         if np.count_nonzero(unknown := falls & sampled & ~touching & ~self.known):
             self._learn_zeros(unknown, mean, mean_std)
@@ -215,8 +216,7 @@ class Baseline:
         count = np.maximum(self._span_count, 1.0)[:, None]
         variance = np.maximum(self._span_squares / count - np.square(self._span_sum / count), 0.0)
         known = self._span_count >= _MIN_VARIANCE_SAMPLES
-        moves = self._span_crossings >= np.minimum(_MIN_CROSSINGS, self._span_count - 2)
-        moves &= self._span_low < self._end_threshold * self.threshold_factor
+        moves = self._swings() & (self._span_low < self._end_threshold * self.threshold_factor)
         now = np.sqrt(2 * variance * moves[:, None])
         lasting = np.minimum(now, self._earlier.min(axis=1))
         kept = np.where(self.touching, 1.0, np.exp(-elapsed_s / _DISTURBANCE_TIME_S))[:, None]
@@ -226,6 +226,10 @@ class Baseline:
         self._earlier[known, 1] = now[known]
         raised = _DISTURBANCE_MARGIN * (self.disturbance @ self._ones) / self._begin_threshold
         np.maximum(raised, 1.0, out=self.threshold_factor)
+
+    def _swings(self) -> BoolArray:
+        """Return the pads (n,) that cross their mean faster than a hand touches."""
+        return np.asarray(self._span_crossings >= np.minimum(_MIN_CROSSINGS, self._span_count - 2))
 
     def _falls(self, mean: FloatArray, mean_std: FloatArray) -> BoolArray:
         """Return the pads (n,) with a channel so much below the baseline that no contact explains it."""
