@@ -15,8 +15,8 @@ import pytest
 from handtouch import connect, wire
 from handtouch.cli import main
 from handtouch.config import Deployment
-from handtouch.record.exact_replay import ExactReplay, recorded_deployment
-from handtouch.record.recording import Recording
+from handtouch.record.exact_replay import ExactReplay, Recomputation, recorded_deployment
+from handtouch.record.recording import RecordedMessage, Recording
 
 from .conftest import DEPLOYMENT, SESSION, Hand, RecordingSession
 
@@ -116,6 +116,54 @@ def test_another_build_is_reported(recorded: Path) -> None:
     ]
     (difference,) = _replayed(entries)[0].result.build_differences
     assert difference.startswith("numpy: recorded 1.0, now")
+
+
+def of_another_version(recorded: Path) -> list[RecordedMessage]:
+    """Return the entries as another version may have written them: its layout, its keys, no calibrations."""
+
+    def changed(entry: RecordedMessage) -> RecordedMessage:
+        payload = dict(entry.payload)
+        if entry.topic == "state":
+            payload |= {"layout": "1-0123456789ab", "state": b"\1\2", "calibrations": [{"id": "x"}]}
+        elif entry.topic == "config":
+            tables = json.loads(payload["deployment"])
+            del tables["touch"]["begin_ms"]
+            payload["deployment"] = json.dumps({**tables, "touch": {**tables["touch"], "begin_samples": 2}})
+            payload["build"] = {**payload["build"], "handtouch": "0.0.7", "source": "abc"}
+        return entry._replace(payload=payload)
+
+    return [changed(entry) for entry in Recording(recorded)]
+
+
+def test_a_recording_of_another_version_names_it_and_the_way_to_recompute_it(recorded: Path) -> None:
+    with pytest.raises(ValueError, match=r"by handtouch 0\.0\.7 \(abc\).*another form.*replay --recompute"):
+        _replayed(of_another_version(recorded))
+
+
+def test_the_inputs_of_another_version_are_recomputed_from_an_empty_state(recorded: Path) -> None:
+    contacts: list[wire.Contact] = []
+    replay = Recomputation(contacts.append)
+    for entry in of_another_version(recorded):
+        replay.process_message(entry)
+    exact, as_recorded = _replayed(Recording(recorded))
+    assert (replay.result.ticks, replay.result.skipped_ticks) == (exact.result.ticks, 0)
+    assert (replay.result.compared, replay.result.contacts) == (0, exact.result.contacts)
+    begins = [[c.begin_ns for c in found if c.event == "begin"] for found in (contacts, as_recorded)]
+    assert begins[0] == begins[1]
+    assert len(begins[0]) > 2
+
+
+def test_recomputing_says_what_it_did_and_needs_a_recording_with_its_own_deployment(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(recorded), "--recompute"]) == 0
+    printed = capsys.readouterr()
+    assert "from an empty state, nothing compared; recorded by handtouch" in printed.err
+    assert "begin" in printed.out
+    config = tmp_path / "hand.toml"
+    config.write_text(DEPLOYMENT)
+    assert main(["replay", str(recorded), str(config), "--recompute"]) == 2
+    assert "--recompute is for an MCAP recording with its own deployment" in capsys.readouterr().err
 
 
 def test_the_recorded_deployment_has_its_files(deployment: Deployment) -> None:

@@ -1,9 +1,10 @@
 """Replay of recorded ticks from their inputs.
 
-Public names: `ReplayResult`, `ExactReplay`, `DeploymentReplay`, `recorded_deployment`.
+Public names: `ReplayResult`, `ExactReplay`, `Recomputation`, `DeploymentReplay`, `recorded_deployment`.
 
 With the recorded deployment on the same build and processor every contact message is the same, bit for bit
-(`ExactReplay`). With another deployment the ticks are computed with its parameters (`DeploymentReplay`).
+(`ExactReplay`). With another deployment the ticks are computed with its parameters (`DeploymentReplay`). The
+inputs of a recording by another version are recomputed from an empty state (`Recomputation`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -234,6 +235,29 @@ class ExactReplay:
         recorded.clear()
 
 
+class Recomputation(ExactReplay):
+    """Replay of a recording's inputs from an empty state: also by another version, whose state can't be read.
+
+    What a daemon learns is learned again, from where the recording begins or ticks are missing; calibrations
+    are those recorded, if they can be read. Nothing is compared.
+    """
+
+    def _restore(self, payload: dict[str, Any]) -> None:
+        if self._model is None or self.pipeline is not None:
+            return
+        with suppress(LookupError, TypeError, ValueError):  # of another version
+            for pad, calibration in enumerate(map(decode_calibration, payload["calibrations"])):
+                self._model.set_calibration(pad, calibration)
+        self.pipeline = self._new_pipeline(payload["session"], self._robots)
+        self.pipeline.state.ticks[0] = payload["tick"]
+        self._limits = _limits(payload["limits"], self.pipeline.model.size)
+
+    def _compare(self) -> None:
+        self.result.contacts += sum(contact.event == "begin" for contact in self._replayed)
+        self._replayed.clear()
+        self._recorded.clear()
+
+
 class DeploymentReplay(ExactReplay):
     """Replay with another deployment of the same pads.
 
@@ -345,11 +369,12 @@ def load_state(pipeline: Pipeline, payload: dict[str, Any], build: dict[str, Any
     try:
         calibrations = [decode_calibration(calibration) for calibration in payload["calibrations"]]
         pipeline.load_state(payload["state"], payload["layout"], calibrations)
-    except (KeyError, StateLayoutError) as error:
-        reason = error if isinstance(error, StateLayoutError) else "the state has no layout"
+    except (KeyError, ValueError) as error:
+        reason = error if isinstance(error, StateLayoutError) else "state or calibrations have another form"
         raise ValueError(
             f"recorded by handtouch {build.get('handtouch', '?')} ({build.get('source', '?')}), which can "
-            f"replay it: {reason}; `handtouch export` reads its contacts and hand frames with any version"
+            f"replay it: {reason}; `handtouch replay --recompute` computes its contacts anew from an empty "
+            "state, `handtouch export` reads those recorded with any version"
         ) from error
 
 

@@ -14,7 +14,7 @@ import msgpack
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.record.comparison import ContactComparison
-from handtouch.record.exact_replay import DeploymentReplay, ExactReplay, ReplayResult
+from handtouch.record.exact_replay import DeploymentReplay, ExactReplay, Recomputation, ReplayResult
 from handtouch.record.recording import RecordedMessage, Recording
 from handtouch.record.replay_sink import ContactCallback, ReplayPublisher
 
@@ -36,16 +36,18 @@ def replay_recording(
     *,
     pace: Callable[[int], None] = lambda _: None,
     publisher: ReplayPublisher | None = None,
+    recompute: bool = False,
 ) -> RecordingReplay:
     """Recompute the contacts of a recording: exactly, or with another `deployment` of the same pads.
 
+    `recompute`: with the recorded deployment from an empty state, without comparison.
     `pace` is called with the time of each tick before it is computed; it may sleep. Raises ValueError,
     OSError.
     """
     comparison = None
     replay: ExactReplay
     if deployment is None:
-        replay = ExactReplay(on_contact, publisher)
+        replay = (Recomputation if recompute else ExactReplay)(on_contact, publisher)
     else:
         comparison = compared = ContactComparison()
 
