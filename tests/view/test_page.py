@@ -36,6 +36,7 @@ from handtouch.view.page.meshes import body_mesh, outline_m, pad_mesh
 from handtouch.view.page.model import PageModel, VersionedValues
 from handtouch.view.page.scene_graph import scene_of
 from handtouch.view.page.server import PageServer
+from tests.view.test_terminal import SERVICE
 
 DEPLOYMENT = config.load(shipped.path("utah_mit.toml"))
 FILES = {hand.urdf: Path(hand.urdf).read_bytes() for hand in DEPLOYMENT.hands if hand.urdf}
@@ -85,6 +86,13 @@ def deployed(deployment: config.Deployment = DEPLOYMENT, run: int = 1) -> wire.C
 def message_lines(model: PageModel) -> list[str]:
     lines = model.values.changes_since(0).get("messages", ())
     return [f"{', '.join(line['links'])}: {line['text']}" for line in lines]
+
+
+def test_a_daemon_that_is_late_is_shown_with_the_rate_that_it_should_have() -> None:
+    for rate_hz, overruns, text in ((200.0, 500, "200"), (17.0, 500, "17 of 200"), (74.0, 0, "74")):
+        model = PageModel()
+        model.add_message(replace(SERVICE, rate_hz=rate_hz, overruns=overruns))
+        assert model.values.changes_since(0)["service"]["tick_rate"] == text
 
 
 # geometry ---------------------------------------------------------------------------------------------------

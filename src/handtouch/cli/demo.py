@@ -149,9 +149,8 @@ def run(
         score = score_contacts(collector.contacts, hand.truth)
         print(f"{score.table()}\n\n{score}" if details else score)
         if (share := collector.late_share) > _BUSY_SHARE:
-            print(
-                f"this computer was too busy for {share:.0%} of the ticks;\n  a quieter one measures better"
-            )
+            print(f"this computer was too busy for {100 * share:.0f} % of the ticks;")
+            print("  a quieter one measures better")
     return 0 if collector.contact_count else 1
 
 

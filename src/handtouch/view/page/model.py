@@ -17,7 +17,13 @@ from pydantic import ValidationError
 from handtouch import wire
 from handtouch.client import columns
 from handtouch.config import Deployment
-from handtouch.view.message_lines import UNCALIBRATED_STATES, active_errors, diagnosis_text, health_news
+from handtouch.view.message_lines import (
+    UNCALIBRATED_STATES,
+    active_errors,
+    diagnosis_text,
+    health_news,
+    tick_rate_text,
+)
 from handtouch.view.page.percepts import PerceptSummaries
 from handtouch.view.page.scene_graph import scene_of
 
@@ -253,7 +259,12 @@ def _service_values(service: wire.Service) -> dict[str, Any]:
     supervisor = service.supervisor or {}
     return {
         "version": service.version,
-        "rate_hz": round(service.rate_hz),
+        "tick_rate": tick_rate_text(
+            rate_hz=service.rate_hz,
+            period_s=service.period_s,
+            overruns=service.overruns,
+            uptime_s=service.uptime_s,
+        ),
         "tick_us": service.tick_us.get("p50"),
         "congestion_episodes": sum(service.congestion_episodes.values()),
         "overruns": service.overruns,

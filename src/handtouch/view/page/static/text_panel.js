@@ -45,7 +45,7 @@ export function drawService({ connected, alive, service, scene }) {
   if (!service) return;
   const tick = service.tick_us ? `tick ${(service.tick_us / 1000).toFixed(2)} ms` : "";
   const supervisor = service.supervisor ? `supervisor ${service.supervisor}` : "";
-  set("service", [`handtouch ${service.version}`, `${service.rate_hz} ticks/s`, tick, `${service.congestion_episodes} congestion episodes`, supervisor].filter(Boolean).join(" · "));
+  set("service", [`handtouch ${service.version}`, `${service.tick_rate} ticks/s`, tick, `${service.congestion_episodes} congestion episodes`, supervisor].filter(Boolean).join(" · "));
   byId("buses").replaceChildren(...Object.entries(service.buses).map(([name, bus]) => {
     const faulty = bus.state !== "active" || bus.problem;
     const line = element("div", faulty ? "faulty" : "", `${name} ${bus.state}, load ${Math.round(100 * bus.load)} %${bus.problem ? `: ${bus.problem}` : ""}`);
@@ -84,7 +84,7 @@ function newChip(pad) {
   const chip = element("button", "", "");
   chip.type = "button";
   chip.dataset.key = pad.key;
-  chip.append(signOf("starting"), element("span", "", pad.name.replaceAll("_", " ")), element("em", "", ""));
+  chip.append(signOf("starting"), element("span", "", pad.name.replace(/[^/]*$/, (link) => link.replaceAll("_", " "))), element("em", "", ""));
   return chip;
 }
 
