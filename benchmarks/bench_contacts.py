@@ -237,14 +237,15 @@ def state_tables(report: Report, found: Mapping[str, Estimates]) -> None:
 
 def main() -> None:
     parser = options(__doc__)
-    parser.add_argument("--hands", type=int, default=6, help="of the profiles; half as many of disturbances")
+    parser.add_argument("--hands", type=int, default=6, help="of the profiles")
+    parser.add_argument("--disturbed", type=int, default=3, help="hands of each disturbance")
     parser.add_argument("--each", type=int, default=5, help="touches of a pad in each profile and range")
     parser.add_argument("--tune", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--only", default="", help="profiles, or disturbances whose names contain this")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
-        asked.hands, asked.each = 1, 1
+        asked.hands, asked.disturbed, asked.each = 1, 1, 1
     family = Family.TUNING if asked.tune else Family.REPORTING
     profiles = [
         Task(DISTURBANCES[0], SHAPES, number, asked.each, family, True)
@@ -254,10 +255,13 @@ def main() -> None:
         Task(one, ROUND, number, asked.each, family, one.gain_step != 1)
         for one in DISTURBANCES
         if asked.only in one.name
-        for number in range((asked.hands + 1) // 2)
+        for number in range(asked.disturbed)
     ]
     report = Report(
-        asked.quick or asked.tune or bool(asked.only), hands=asked.hands, touches_of_a_cell=asked.each
+        asked.quick or asked.tune or bool(asked.only),
+        hands=asked.hands,
+        hands_of_a_disturbance=asked.disturbed,
+        touches_of_a_pad_in_a_cell=asked.each,
     )
     made = []
     with ProcessPoolExecutor(asked.processes) as pool:

@@ -20,7 +20,7 @@ from benchmarks.page import OUT, keep_run_time, run_time
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
-    "diagnose", "worlds", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
+    "diagnose", "worlds", "contacts", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
     "swap", "shear_slip", "estimate", "percept_grasp", "shear", "design", "switched",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside); the
