@@ -67,7 +67,8 @@ class TareJob:
         difference = np.where(new[:, None], tick.counts - self._reference_counts, 0.0)
         self._sum += difference
         self._sum_of_squares += difference**2
-        self._touched |= tick.contacts.touching
+        # a load since the start, of unknown zeros, is what the user says it is: none
+        self._touched |= tick.contacts.touching & tick.state.known
         shear = tick.channel_counts[:, tick.model.channels :]
         self._shear_sum[:, : shear.shape[1]] += shear * new[:, None]
         saturated = self._pipeline.slab.saturated(tick.channel_counts)[:, tick.model.channels :]
@@ -131,7 +132,7 @@ class TareJob:
         baseline = self._tick.baseline
         moved = np.abs(mean - baseline.expected_counts[pad, : len(mean)]).sum()
         allowed = model.end_threshold_counts[pad] + _MAX_OFFSET_SIGMA * np.hypot(noise, baseline.std[pad])
-        if moved > allowed:
+        if moved > allowed and self._tick.state.known[pad]:
             return (
                 f"offset of {moved:.0f} counts from the baseline, noise and drift explain {allowed:.0f}: "
                 "remove the load; if there is none, inspect the pad and set its offsets with "
