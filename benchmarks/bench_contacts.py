@@ -119,7 +119,6 @@ class Task:
     shapes: Mapping[str, Mapping[str, Any]]
     number: int
     each: int
-    family: Family
     learns: bool
 
 
@@ -152,8 +151,8 @@ def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tup
 
 def play(task: Task) -> dict[str, Estimates]:
     """Return estimates of position and of force of a hand, in each state."""
-    drawn = task.disturbance.world.draw(task.family.seed(task.number))
-    builder = WORLD.draw(task.family.seed(task.number))
+    drawn = task.disturbance.world.draw(Family.REPORTING.seed(task.number))
+    builder = WORLD.draw(Family.REPORTING.seed(task.number))
     deployment = builder.describe(load(shipped.path("utah_mit.toml")))
     model = build_pad_model(deployment)
     first = WARM_UP + (QUIET if task.disturbance.is_noise else 0)
@@ -240,25 +239,23 @@ def main() -> None:
     parser.add_argument("--hands", type=int, default=6, help="of the profiles")
     parser.add_argument("--disturbed", type=int, default=3, help="hands of each disturbance")
     parser.add_argument("--each", type=int, default=5, help="touches of a pad in each profile and range")
-    parser.add_argument("--tune", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--only", default="", help="profiles, or disturbances whose names contain this")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.disturbed, asked.each = 1, 1, 1
-    family = Family.TUNING if asked.tune else Family.REPORTING
     profiles = [
-        Task(DISTURBANCES[0], SHAPES, number, asked.each, family, True)
+        Task(DISTURBANCES[0], SHAPES, number, asked.each, True)
         for number in range(asked.hands if asked.only in ("", "profiles") else 0)
     ]
     disturbed = [
-        Task(one, ROUND, number, asked.each, family, one.gain_step != 1)
+        Task(one, ROUND, number, asked.each, one.gain_step != 1)
         for one in DISTURBANCES
         if asked.only in one.name
         for number in range(asked.disturbed)
     ]
     report = Report(
-        asked.quick or asked.tune or bool(asked.only),
+        asked.quick or bool(asked.only),
         hands=asked.hands,
         hands_of_a_disturbance=asked.disturbed,
         touches_of_a_pad_in_a_cell=asked.each,
