@@ -452,6 +452,24 @@ def test_saturated_channel_ends_when_it_recovers() -> None:
     assert [f.electrodes for f in changes if f.until_ns is not None] == [("yb",)]
 
 
+def test_a_hold_is_as_old_as_the_first_samples_however_long_the_host_is_up() -> None:
+    """Before the first sample of any node, blocks have samples of 0 counts at the time 0."""
+    diagnosis = HandDiagnostics(model(), tables=_TABLES)
+    for _ in range(3):
+        nothing = np.zeros((50, 2), np.int64)
+        diagnosis.process_block(
+            HandSamples(nothing, np.zeros((50, 2, 4), np.int64), nothing.astype(np.bool_))
+        )
+    begin_ns, rng, changes = 20_000 * SECOND, np.random.default_rng(7), []
+    for first in np.arange(0, 5, 0.5):
+        stamps = np.repeat(
+            (begin_ns + np.rint((first + np.arange(50) / 100) * SECOND)).astype(np.int64)[:, None], 2, 1
+        )
+        read = np.rint(rng.normal(size=(50, 2, 4)) + [[[300, 200, 250, 250]], [[0] * 4]][0]).astype(np.int64)
+        changes += diagnosis.process_block(HandSamples(stamps, read, np.ones((50, 2), np.bool_)))
+    assert changes == []  # a hold of five seconds
+
+
 def test_block_of_another_hand_is_refused() -> None:
     with pytest.raises(ValueError, match=r"must be \(m, 2, 4\)"):
         HandDiagnostics(model()).process_block(

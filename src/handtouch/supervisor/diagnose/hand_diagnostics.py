@@ -117,6 +117,8 @@ class HandDiagnostics:
         """
         features = extract_features(block, self._model, self._offsets)
         sample_ns = int(features.last_sample_ns.max())
+        if sample_ns <= 0:  # no pad has been sampled yet
+            return []
         self._channels.process_block(features)
         faulty = self._channels.faulty_channels
         healthy: BoolArray = np.asarray(np.logical_not(faulty.any(axis=1)))
