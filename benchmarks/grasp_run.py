@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from benchmarks.daemon_settings import InlineProcess, decoded, pipeline_of
 from handtouch import wire
 from handtouch.config import Deployment, Touch
-from handtouch.core.link_poses import LinkPoses
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.slab import ChannelField
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.inputs import InputReceiver
 from handtouch.daemon.percepts import PerceptPublisher

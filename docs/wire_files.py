@@ -1,4 +1,5 @@
-"""Files that follow from the declarations of the messages: of the package, the clients and these pages.
+"""Files that follow from the declarations of messages and of the stages' records: of the package, the clients
+and these pages.
 
 `make tables` writes them, and `python -m docs.wire_files --check` names those that differ. Public name:
 `wire_files`.
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from docs.stage_rows import rows_pxd
 from docs.wire_tables import schema_text, with_tables
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.wire.columns import Column, vector_length
@@ -58,6 +60,7 @@ def wire_files() -> dict[Path, str]:
         "clients/js/fields.d.ts": _js_types,
         "docs/wire.md": lambda: with_tables((ROOT / "docs/wire.md").read_text()),
         "docs/wire.schema.json": schema_text,
+        "src/handtouch/core/stages/rows.pxd": rows_pxd,
     }
     files = {ROOT / name: make() for name, make in makers.items()}
     return {path: _formatted(path, text) if path.suffix == ".py" else text for path, text in files.items()}

@@ -13,7 +13,7 @@ from handtouch.config import (
     shipped,
 )
 from handtouch.core.gravity import GravityTracker
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.joints import JointStateBuffer
 from handtouch.hand.robot_models import RobotModels, check_urdfs
 from tests.core.conftest import DEPLOYMENT as PLAIN

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
 from handtouch.core.contact_solver import PART_COUNT
-from handtouch.core.link_poses import LinkPose, LinkPoses
+from handtouch.core.stages.kinematics import LinkPose, LinkPoses
 from handtouch.core.state import TickState
 from handtouch.core.tick import PadColumns, TickResult
 from handtouch.core.transforms import ContactTransforms

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from handtouch import Robot, config
 from handtouch.config import shipped
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.pads import mount_transform, pad_surface
 from handtouch.hand.urdf import read_urdf

@@ -14,7 +14,7 @@ import pytest
 
 from handtouch.cli.check import run
 from handtouch.config import ConfigError, load
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.robot_models import RobotModels, check_urdfs, unchecked_items
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -27,7 +27,7 @@ from websockets.typing import Subprotocol
 from handtouch import config
 from handtouch.client import connect
 from handtouch.config import shipped
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import read_urdf
 from handtouch.record.foxglove import (

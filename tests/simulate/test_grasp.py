@@ -12,7 +12,7 @@ from benchmarks import grasp_run
 from handtouch import config
 from handtouch.cli import main
 from handtouch.config import shipped
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.pads import mount_transform
 from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate import grasp as grasping

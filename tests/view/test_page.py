@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from handtouch import config, wire
 from handtouch.config import shipped
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.field.surface import (
     ConeSurface,
     CylinderSurface,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.baseline import BLOCK_DURATION_NS
-from handtouch.core.link_poses import LinkPoses
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.groups import ContactGroups
-from handtouch.core.link_poses import LinkPoses
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.frames import FRAME_SLICES, FRAME_VALUES, FrameStage, HandFrames
+from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.core.state import TickState
 from handtouch.hand.joints import JointSnapshot
 
@@ -167,7 +167,7 @@ def _hand_frames(robots: RobotModels, number: int, poses: LinkPoses) -> HandFram
     kinematics, rows, mounts = robots.kinematics[number], robots.pad_rows[number], robots.mounts[number]
     masks = np.stack([kinematics.palm_joint_mask, kinematics.base_joint_mask])
     return HandFrames(
-        *(poses.stage, int(rows[0]), int(rows[-1]) + 1, view_memory(masks)),
+        *(poses, int(rows[0]), int(rows[-1]) + 1, view_memory(masks)),
         *(view_memory(robots.joint_std[number]), view_memory(mounts.origin_m)),
         *(mounts.position_variance_m2, mounts.rotation_variance_rad2, robots.joints_stale_s[number]),
         view_memory(np.zeros(poses.joints)),

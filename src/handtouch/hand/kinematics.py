@@ -1,6 +1,6 @@
 """Kinematic tree of a hand from its URDF: the joints between its links, its palm and its base.
 
-Public name: `HandKinematics`. `handtouch.core.link_poses` computes poses.
+Public name: `HandKinematics`. `handtouch.core.stages.kinematics` computes poses.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ cdef double _NAN, _INFINITY
 cdef long long _NEVER_NS
 
 cdef class HandFrames:
-    cdef kinematics.JointTree tree
+    cdef kinematics.LinkPoses tree
     cdef Py_ssize_t first, stop
     cdef unsigned char[::1] masks
     cdef double[::1] stds, mounts, used_stds

@@ -36,7 +36,7 @@ class HandFrames:
 
     def __init__(
         self,
-        tree: kinematics.JointTree,
+        tree: kinematics.LinkPoses,
         first: int,
         stop: int,
         masks: memoryview[int],
