@@ -63,9 +63,11 @@ def solved_currents(x_mm: float, y_mm: float, force_n: float, tilt: float = 0.0)
     return 2.0 / OHM * np.array(sides)
 
 
-def located_mm(currents_a: FloatArray, crowded: bool = True) -> tuple[FloatArray, float]:
+def located_mm(
+    currents_a: FloatArray, crowded: bool = True, stated: Deployment | None = None
+) -> tuple[FloatArray, float]:
     """Return position [mm] and standard deviation [mm] of a contact with these currents (4,)."""
-    model, values = build_pad_model(deployment(crowded)), np.full((1, VALUE_COUNT), np.nan)
+    model, values = build_pad_model(stated or deployment(crowded)), np.full((1, VALUE_COUNT), np.nan)
     make_solver(model, currents_a[None], np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
         np.arange(1).data
     )
@@ -98,3 +100,34 @@ def test_a_contact_over_the_edge_is_nearer_to_the_middle_of_its_part_on_the_pad_
     middle_mm = points[points > 0].mean()
     found_mm, without_mm = located_mm(currents_a)[0][0], located_mm(currents_a, False)[0][0]
     assert abs(found_mm - middle_mm) < abs(without_mm - middle_mm)
+
+
+@pytest.mark.parametrize("force_n", [2.0, 3.0])
+def test_a_pressure_that_rises_to_one_side_has_its_centre_within_the_region_of_contact_tilt_std(
+    force_n: float,
+) -> None:
+    tilted = deployment(True)
+    sheet = tilted.sheets["s"].model_copy(update={"contact_tilt_std": 0.3, "contact_elongation_std": 0.4})
+    tilted = tilted.model_copy(update={"sheets": {"s": sheet}})
+    centre_mm = np.array([13.0 + RADIUS_MM / 4, 11.0])
+    currents_a = solved_currents(13.0, 11.0, force_n, tilt=1.0)
+    found_mm, std_mm = located_mm(currents_a, stated=tilted)
+    error_mm = float(np.hypot(*(found_mm - centre_mm)))
+    assert 0.05 < error_mm < 2.45 * std_mm / np.sqrt(2)
+    assert std_mm < 0.3
+
+
+def test_leads_that_the_file_does_not_state_are_within_series_std_ohm() -> None:
+    stated = deployment(True)
+    node = stated.nodes["n"].model_copy(update={"series_std_ohm": 2.0})
+    model = build_pad_model(stated)
+    (network,) = model.networks
+    with_leads = network.with_series_ohm([3.0, 0.0, 1.0, 2.0])
+    currents_a = 2e-3 * with_leads.fractions(0.3 * network.a, 0.6 * network.b)
+    expected_mm = np.array([0.3 * LENGTH_MM, 0.6 * WIDTH_MM])
+    known = stated.model_copy(update={"nodes": {"n": node}})
+    (found_mm, std_mm), (without_mm, narrow_mm) = (
+        located_mm(currents_a, stated=one) for one in (known, stated)
+    )
+    assert np.hypot(*(found_mm - expected_mm)) < 2.45 * std_mm / np.sqrt(2)
+    assert np.hypot(*(without_mm - expected_mm)) > 2.45 * narrow_mm
