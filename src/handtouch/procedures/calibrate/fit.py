@@ -49,6 +49,9 @@ _MAX_HALF_INTERVALS = {
 }  # half widths above which an interval is useless
 _MIN_CURRENT_SLOPE = 0.2  # d ln current / d ln force; 1 to 2 if the contact limits the current
 _MIN_LAW_PROBABILITY = 1e-3  # probability below which the readings contradict any such law
+_MODEL_LOG_STD = 0.002
+"""Of the law itself, against contacts that are solved (the simulator's world `ideal`): readings without any
+scatter don't contradict it"""
 _NO_FIT_DEVIANCE = 1e6
 _MAX_ITERATIONS, _MAX_STEP, _CONVERGED_STEP = 60, 1.0, 1e-9
 _DIFFERENCE_STEP = 1e-5
@@ -431,6 +434,7 @@ def _lack_of_fit_probability(solved: _LawSolution, residual: FloatArray) -> floa
         return 1.0
     pure = float(((scaled - mean[group]) ** 2).sum()) / pure_freedom
     lack = float((count * mean**2).sum()) / lack_freedom
+    pure += float(np.mean(_MODEL_LOG_STD**2 / solved.variance)) * len(scaled) / len(count)
     if pure <= 0:
         return 1.0
     from scipy.special import fdtrc
