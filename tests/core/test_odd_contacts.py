@@ -41,7 +41,8 @@ def fill_state(state: TickState, rng: np.random.Generator) -> None:
         column[:] = rng.choice(ODD, column.shape) if rng.random() < 0.3 else rng.normal(size=column.shape)
     parts = state.parts.reshape(state.pads, 2, -1)
     parts[:] = rng.normal(size=parts.shape) if rng.random() < 0.5 else np.nan
-    parts[:, :, 15:] = rng.choice(ODD, (state.pads, 2, 2))
+    parts[:, :, 15:17] = rng.choice(ODD, (state.pads, 2, 2))
+    parts[:, :, 17] = rng.integers(1, 1 << 40, (state.pads, 2))
     state.total_current_a[:] = rng.normal(size=state.pads)  # of finite counts
     for integers in (state.contact_seq, state.sample_ns, state.begin_ns, state.silent_ns):
         integers[:] = rng.choice(INTEGERS, state.pads)
@@ -135,6 +136,7 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
                 (row[6:15] + added).tolist(),
                 finite(row[15]),
                 finite(row[16]),
+                int(row[17]),
             )
             for row in rows
         ]

@@ -142,7 +142,8 @@ class _ValidationMistake:
         if self.error_type.startswith("union_tag"):
             given = self.error["input"].get("kind") if isinstance(self.error["input"], dict) else None
             at, value = (".kind", f" = {_format_input(given)}") if given is not None else ("", value)
-            at = at if self.key_path else at.replace(".", ": ")
+            is_whole = self.section.startswith("[") and not (self.section.startswith("[[") or self.key_path)
+            at = at.replace(".", ": ") if is_whole else at
             kinds = self.kinds[_kind_table(self.path, self.kinds)]
             hint = suggest_name(str(given), list(kinds))
             known = _join_alternatives(map(_format_input, kinds))
