@@ -517,14 +517,19 @@ def beats_missed(fault: Fault, health: Any) -> bool:
     return bool(health.heartbeats_missed > fault.health[health.node_id].heartbeats_missed)
 
 
+def _is_reason_as_before(fault: Fault, health: Any) -> bool:
+    """Check that an EMCY is no reason of the pad's state; it may have one, such as unknown zeros."""
+    return bool(health.reason == fault.health[health.node_id].reason)
+
+
 def emergency_reported(fault: Fault, health: Any) -> bool:
     found = [error for error in health.emergencies if error["code"] == fault.kept]
-    return bool(found) and found[-1]["cleared_ns"] is None and health.reason == ""
+    return bool(found) and found[-1]["cleared_ns"] is None and _is_reason_as_before(fault, health)
 
 
 def emergency_cleared(fault: Fault, health: Any) -> bool:
     found = [error for error in health.emergencies if error["code"] == fault.kept]
-    return bool(found) and found[-1]["cleared_ns"] is not None and health.reason == ""
+    return bool(found) and found[-1]["cleared_ns"] is not None and _is_reason_as_before(fault, health)
 
 
 def illegal_reported(fault: Fault, health: Any) -> bool:

@@ -268,7 +268,7 @@ def test_snapshot_solves_unrequested_outputs_and_leaves_no_trace(served: Bench) 
     (contact,) = served.ask("snapshot")["contacts"]
     assert (contact["position_status"], contact["force_status"], contact["link"]) == (
         "unreliable",  # no point of a pad of 30 x 24 mm sends the same current to every electrode
-        "valid",
+        "unreliable",  # nor is the force that of one contact
         "plane",
     )
     assert np.isnan(columns.position_m[0]).all()
@@ -291,7 +291,7 @@ def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
     model = served.pipeline.model
     assert served.pipeline.tick.model is model
     assert model.calibrations[1].calibration_id == "c1"
-    assert (served.pipeline.tick.baseline.expected_counts[1] > 1.0).all()  # it tracks the readings of 0
+    assert (served.pipeline.tick.baseline.expected_counts[1] > 0.5).all()  # it falls to the readings of 0
     assert model.calibrations[0].calibration_id == model.default_calibration_ids[0]
     assert int(served.pipeline.tick.contacts.id[0]) == contact
     assert model.begin_threshold_a[0] != 0

@@ -231,8 +231,8 @@ class StatusReporter:
                 f"0x{self._pads[event.slot][1].node_id:02X} ({hand}/{link})"
                 for event, (hand, link) in zip(group, names, strict=True)
             ]
-            if len(nodes) > _MAX_NODES_NAMED:
-                nodes[1:-1] = ["..."]
+            if len(nodes) > _MAX_NODES_NAMED and level < logging.WARNING:
+                nodes[1:-1] = ["..."]  # of warnings and errors, all nodes are named
             _log.log(
                 level,
                 "%s %s: %s",
