@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,7 @@ def test_two_nodes_with_one_id_are_logged_as_errors(rig: Any) -> None:
 
     def named() -> set[str]:
         errors = [line for line in rig.printed("run").splitlines() if line.startswith("ERROR")]
-        return {line.split("(")[1].split(")")[0] for line in errors if "duplicate node id" in line}
+        duplicate = [line for line in errors if "duplicate node id" in line]
+        return {name for line in duplicate for name in re.findall(r"\((\w+/\w+)\)", line)}
 
     rig.wait("all named in the log", lambda _: len(named()) == 15)

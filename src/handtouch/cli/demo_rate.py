@@ -21,7 +21,7 @@ _MAX_LOAD = 0.25
 """Part of a period for solving contacts; the simulated hand and the view share the interpreter."""
 _MAX_PERIOD_MS = 1000.0  # longest period that a deployment may state
 _MIN_PROCESSORS, _SHARED_PERIOD_MS = 4, 10.0
-"""A simulated hand takes 2.2 ms for a sample with touches, on two processors of 2026; at 200 Hz, its nodes then
+"""A simulated hand takes 2.2 ms for a sample with touches, on two processors of 2026: at 200 Hz, its nodes
 answer too late while the supervisor builds its tables beside it"""
 _TRIALS = 5
 _CONTACT_RADII = 10.0  # current of a trial's contacts, in thresholds of detection
