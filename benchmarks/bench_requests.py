@@ -7,6 +7,7 @@ of the loop's time at most, whatever they cost: then they wait.
 
 from __future__ import annotations
 
+import gc
 import tempfile
 import time
 from collections.abc import Iterator
@@ -117,6 +118,8 @@ def measure(daemon: HandtouchDaemon, names: list[str], repeats: int) -> list[dic
         _, answer = control.start_request(msgpack.packb(request), t_ns)
         assert isinstance(answer, dict)
         assert answer["ok"], answer
+    gc.collect()
+    gc.freeze()  # as the daemon does before its loop
     rows = []
     for name, requests in worst_requests(names, repeats).items():
         frames = [msgpack.packb({"v": 1, **request}) for request in requests] or [b"\xc1" * 60_000]
