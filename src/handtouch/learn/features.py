@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.client.hand_arrays import SAMPLED_STATES
 from handtouch.wire import ForceStatus, FrameStatus, PadState, PositionStatus
 
 FloatArray = NDArray[np.float32]
@@ -20,7 +21,6 @@ MAX_AGE_S = 1.0
 _MAX_FORCE_N = 100.0
 """Bound of forces for spaces that need one: ten times the largest that a shipped pad measures"""
 _MAX_POSITION_M = 0.5
-_SAMPLED = (PadState.CLEAR, PadState.TOUCHED)
 
 
 class Feature(NamedTuple):
@@ -228,7 +228,7 @@ def _sampled(source: Any, state: NDArray[Any], rows: list[int]) -> NDArray[np.bo
     """Return where pads are sampled: of a `Hand` also by the age of its frame."""
     sampled = getattr(source, "sampled", None)
     if sampled is None:
-        return np.isin(state, _SAMPLED)
+        return np.isin(state, SAMPLED_STATES)
     return np.asarray(getattr(sampled, "array", sampled), np.bool_)[..., rows]
 
 

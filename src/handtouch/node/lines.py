@@ -158,7 +158,7 @@ class LinesReader:
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE_BYTES:
             self._rest, self._skips_line = b"", True
-            self._count_malformed(b"a longer line than 4096 bytes")
+            self._count_malformed(f"a longer line than {MAX_LINE_BYTES} bytes".encode())
         for line in lines:
             if self._skips_line:
                 self._skips_line = False

@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from handtouch import client, wire
 from handtouch.calibration.calibration import LawParameters
+from handtouch.client.hand_arrays import SAMPLED_STATES
 from handtouch.procedures.calibrate.procedure import PadSample
 
 _RECEIVE_TIMEOUT_S = 0.5
@@ -114,7 +115,7 @@ class ServedPad:
         x, y = columns["pad_m"][row].tolist()
         return PadSample(
             frame.t_ns,
-            alive=state in (wire.PadState.CLEAR, wire.PadState.TOUCHED),
+            alive=state in SAMPLED_STATES,
             touched=state is wire.PadState.TOUCHED,
             current_a=float(columns["total_current_a"][row]),
             position_m=(x, y),
