@@ -247,6 +247,19 @@ def test_poll_serves_all_that_has_come(three: Any) -> None:
     assert three.bus.sync_count == 2
 
 
+def test_nodes_slower_than_sync_answer_the_newest_and_everything_else(three: Any) -> None:
+    def frame(identifier: int, *data: int) -> can.Message:
+        return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+    read_type = frame(0x601, 0x40, 0x00, 0x10, 0, 0, 0, 0, 0)
+    three.wire.incoming = [frame(0, 1, 0), *[frame(0x80)] * 50, read_type, *[frame(0x80)] * 50]
+    three.bus.poll()
+    assert (three.bus.sync_count, three.bus.skipped_syncs) == (8, 92)
+    identifiers = [identifier for identifier, _ in three.take()]
+    assert identifiers[0] == 0x581  # no SYNC before it is among the newest
+    assert len(identifiers) == 1 + 8 * 3
+
+
 def test_frames_from_before_power_on_are_not_answered_and_all_are_plugged_in(bench: Any) -> None:
     bench.bus.add(1)
     bench.bus.add_twin(1, serial=2)

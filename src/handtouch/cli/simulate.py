@@ -222,7 +222,8 @@ def _serve(
     hand.stop()
     if truth:  # not earlier: computing it would delay the nodes
         truth_file.write_records(truth, hand.pop_truth())
-    print(f"{hand.sync_count} SYNCs answered", flush=True)
+    skipped = f", {hand.skipped_syncs} skipped: the nodes were late" if hand.skipped_syncs else ""
+    print(f"{hand.sync_count} SYNCs answered{skipped}", flush=True)
 
 
 def _status_line(hand: SimulatedHand, deployment: config.Deployment, elapsed_s: float, rate_hz: float) -> str:

@@ -35,6 +35,8 @@ _COUNT_BYTES, _SAMPLE_BYTES = 2, 2 * CHANNELS  # bytes of the standard layout: i
 _MIN_INT16, _MAX_INT16 = np.int64(-32768), np.int64(32767)
 _MAX_WAIT_S = 0.1  # so that `stop` is prompt
 _MAX_DISCARDED_FRAMES = 100_000  # so that constant traffic doesn't delay the start
+_MAX_WAITING_SYNCS = 8  # of a short pause, which are answered late; more are a backlog
+_MAX_FRAMES_AT_ONCE = 1000
 _RETRY_S = 0.1  # between attempts on a failing bus
 
 _log = logging.getLogger(__name__)
@@ -45,7 +47,8 @@ class DeviceBus:
 
     `sample` is called once for all nodes at every SYNC, and every `sample_period_ns` while an operational
     node has an event-driven TPDO. Counters: `rejected` malformed frames, `send_failures` frames that the bus
-    refused, `bus_errors` failed reads, `sync_count` SYNCs handled, `sample_count` samples taken.
+    refused, `bus_errors` failed reads, `sync_count` SYNCs handled, `skipped_syncs` SYNCs left unanswered
+    because newer ones were waiting, `sample_count` samples taken.
     """
 
     def __init__(
@@ -57,7 +60,8 @@ class DeviceBus:
     ) -> None:
         self.devices: dict[int, Device] = {}
         self.lock = threading.RLock()
-        self.rejected = self.send_failures = self.bus_errors = self.sync_count = self.sample_count = 0
+        self.rejected = self.send_failures = self.bus_errors = 0
+        self.sync_count = self.skipped_syncs = self.sample_count = 0
         self._bus = bus
         self._sample = sample
         self._sample_period_ns = sample_period_ns
@@ -211,18 +215,34 @@ class DeviceBus:
             return self._next_sample_ns if next_ns is None else min(next_ns, self._next_sample_ns)
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Wait up to `timeout_s` for a frame or due time, then handle all received frames."""
+        """Wait up to `timeout_s` for a frame or due time, then handle the frames received until now.
+
+        Of more SYNCs than `_MAX_WAITING_SYNCS` the oldest aren't answered, so that nodes whose samples take
+        longer than a period answer everything else in time; `skipped_syncs` counts them.
+        """
         now_ns = self._clock()
         due_ns = self.advance(now_ns)
         if due_ns is not None:
             timeout_s = min(timeout_s, max(0.0, (due_ns - now_ns) * 1e-9))
         frame = self._bus.recv(timeout_s)
         self.advance(self._clock())
-        while frame is not None:
-            now_ns = self._clock()
-            self.handle_frame(frame, now_ns)
-            self.advance(now_ns)  # a flood of frames must not delay heartbeats
+        frames: list[can.Message] = []
+        while frame is not None and len(frames) < _MAX_FRAMES_AT_ONCE:
+            frames.append(frame)
             frame = self._bus.recv(0.0)
+        for received in self._without_stale_syncs(frames if frame is None else [*frames, frame]):
+            now_ns = self._clock()
+            self.handle_frame(received, now_ns)
+            self.advance(now_ns)  # a flood of frames must not delay heartbeats
+
+    def _without_stale_syncs(self, frames: list[can.Message]) -> list[can.Message]:
+        stale = [k for k, frame in enumerate(frames) if frame.arbitration_id == cia301.SYNC][
+            :-_MAX_WAITING_SYNCS
+        ]
+        if stale and not self.skipped_syncs:
+            _log.warning("nodes don't keep up with SYNC: %d not answered; lower its rate", len(stale))
+        self.skipped_syncs += len(stale)
+        return [frame for k, frame in enumerate(frames) if k not in stale]
 
     def start(self) -> None:
         """Plug in every node and serve them from a thread; frames received before are dropped."""

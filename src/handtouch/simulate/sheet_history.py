@@ -65,8 +65,11 @@ class SimulatedSheetHistory:
         self._excitation_switches.append((t_s, on))
         self._force_ratios = None
 
-    def force_ratio(self, times_s: FloatArray) -> FloatArray:
-        """Return apparent over true force at times (n,) of contact."""
+    def force_ratio(self, times_s: FloatArray, total_force_n: FloatArray | None = None) -> FloatArray:
+        """Return apparent over true force at times (n,) of contact.
+
+        total_force_n: (n,), force on the sheet where it is known; left out: that of the touches and faults.
+        """
         if len(times_s) == 0:
             return np.ones(0)
         if times_s.min() < self._checkpoints[0][0]:  # before the oldest checkpoint: start again
@@ -77,9 +80,9 @@ class SimulatedSheetHistory:
             self._force_ratios = next(whole), next(whole)
         times, ratios = self._force_ratios
         smooth = np.interp(times_s, times, ratios) if len(times) else np.ones(len(times_s))
-        return smooth * self._random_factor(
-            times_s, smooth * self._total_force_n(self._scenario_time_s(times_s))
-        )
+        if total_force_n is None:
+            total_force_n = self._total_force_n(self._scenario_time_s(times_s))
+        return smooth * self._random_factor(times_s, smooth * total_force_n)
 
     def extend_ahead(self, t_s: float) -> None:
         """Integrate in advance, so that times soon after `t_s` need no computation."""
@@ -165,7 +168,7 @@ def random_factor(
         steps = times_s / law.noise_time_s
         before = np.floor(steps)
         part, first = steps - before, before.astype(np.int64)
-        low, high = (noise.standard_normal(key + np.uint64(1), first + i) for i in (0, 1))
+        low, high = noise.standard_normal(key + np.uint64(1), np.stack([first, first + 1]))
         flicker = ((1 - part) * low + part * high) / np.hypot(part, 1 - part)
         factor *= np.exp(law.noise_std / np.sqrt(np.maximum(apparent_n, 1e-3)) * flicker)
     return factor

@@ -165,6 +165,11 @@ class SimulatedHand:
         return sum(bus.nodes.sync_count for bus in self._buses)
 
     @property
+    def skipped_syncs(self) -> int:
+        """Number of SYNCs left unanswered since newer ones were waiting, all buses together."""
+        return sum(bus.nodes.skipped_syncs for bus in self._buses)
+
+    @property
     def buses_without_sync(self) -> list[str]:
         """Names of the buses that have received no SYNC yet."""
         return [bus.name for bus in self._buses if not bus.nodes.sync_count]

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -70,10 +70,10 @@ class _Profile(NamedTuple):
         return self.tilt / 4
 
     def pressure(self, point: FloatArray) -> FloatArray:
-        """Return the pressure (k, n), in any unit, at points (k, 2, n)."""
+        """Return the pressure (..., n), in any unit, at points (..., 2, n)."""
         if self.is_hertz:
-            return np.asarray(np.sqrt(np.maximum(1 - (point**2).sum(axis=1), _MIN_PRESSURE)))
-        return np.asarray(np.maximum(1 + self.tilt * point[:, 0], _MIN_PRESSURE))
+            return np.asarray(np.sqrt(np.maximum(1 - (point**2).sum(axis=-2), _MIN_PRESSURE)))
+        return np.asarray(np.maximum(1 + self.tilt * point[..., 0, :], _MIN_PRESSURE))
 
 
 @cache
@@ -123,12 +123,16 @@ class PatchNodes(NamedTuple):
     def of_patches(cls, shape: SimulatedSurface, position: FloatArray, patch: FloatArray) -> PatchNodes:
         """Return the nodes of patches (PATCH_ROWS, k) whose pressures' centres, were they all on the pad, are
         at positions (2, k), fractions of the pad."""
-        numbers = patch[3].astype(np.intp)
-        groups = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
+        groups: dict[tuple[float, float, float], list[int]] = {}
+        for k, form in enumerate(zip(*patch[1:].tolist(), strict=True)):
+            groups.setdefault(form, []).append(k)
         parts = [
-            _nodes_of(shape, position[:, at], patch[:, at], _profile(int(numbers[at[0]]))) for at in groups
+            _nodes_of(shape, position[:, at], patch[0, at], _form(*form, shape.stretch))
+            for form, at in groups.items()
         ]
-        return cls.joined(parts).taken(np.argsort(np.concatenate(groups)))
+        if len(parts) == 1:
+            return parts[0]
+        return cls.joined(parts).taken(np.argsort(np.concatenate(list(groups.values()))))
 
     @classmethod
     def joined(cls, parts: Sequence[PatchNodes]) -> PatchNodes:
@@ -150,40 +154,66 @@ def _stretch(shape: SimulatedSurface) -> FloatArray:
     return np.array([[shape.stretch], [1.0]])
 
 
-def _nodes_of(
-    shape: SimulatedSurface, position: FloatArray, patch: FloatArray, profile: _Profile
-) -> PatchNodes:
-    """Return the nodes of patches of one profile."""
-    axes = half_axes(patch)  # (k, 2, 2)
-    stretch = _stretch(shape)
-    to_fractions = np.stack(
-        [shape.fractions_of(position, axes[:, :, column].T).T for column in (0, 1)], axis=2
-    )
-    point, squeeze = _points_on_pad(position.T - profile.shift * to_fractions[:, :, 0], to_fractions, profile)
-    own = _log_own(stretch * axes, profile) + np.log((1 + squeeze) / 2).sum(axis=1)
+class _Form(NamedTuple):
+    """What patches of one form, of any size and place, have in common; lengths are over the radius."""
+
+    profile: _Profile
+    axes: FloatArray
+    """(2, 2), carries the unit disc to the patch."""
+    stretch: FloatArray
+    """(2, 1), lengths along x and y in the isotropic equivalent of the sheet."""
+    log_own: FloatArray
+    """(NODES,), logarithm of `PatchNodes.own_m`."""
+
+
+@lru_cache(maxsize=4096)
+def _form(elongation: float, direction_rad: float, number: float, stretch: float) -> _Form:
+    profile, lengths = _profile(int(number)), np.array([[stretch], [1.0]])
+    axes = half_axes(np.array([[1.0], [elongation], [direction_rad]]))
+    return _Form(profile, axes[0], lengths, _log_own(lengths * axes, profile)[0])
+
+
+def _nodes_of(shape: SimulatedSurface, position: FloatArray, radius_m: FloatArray, form: _Form) -> PatchNodes:
+    """Return the nodes of patches of one form."""
+    profile, k = form.profile, len(radius_m)
+    axes = radius_m[:, None, None] * form.axes
+    both = axes.transpose(1, 2, 0).reshape(2, 2 * k)  # first the long ones
+    to_fractions = shape.fractions_of(np.concatenate([position, position], axis=1), both)
+    to_fractions = to_fractions.reshape(2, 2, k).transpose(2, 0, 1)
+    middle = position.T - profile.shift * to_fractions[:, :, 0]
+    point, area = profile.point, (radius_m**2)[:, None] * profile.area
+    own_m = radius_m[:, None] * np.exp(form.log_own)
+    if (over := _is_over_edge(middle, to_fractions, profile)).any():
+        point, squeeze = _points_on_pad(middle, to_fractions, profile, over)
+        area, own_m = area * squeeze.prod(axis=1), own_m * ((1 + squeeze) / 2).prod(axis=1)
     vector_m = axes @ point - profile.shift * axes[:, :, :1]
-    area = patch[0][:, None] ** 2 * profile.area * squeeze.prod(axis=1)
     pressure = profile.pressure(point)
     pressure = pressure / (area * pressure).sum(axis=1, keepdims=True)
     fractions = np.clip(shape.fractions_beside(position, vector_m), _EDGE, 1 - _EDGE)
-    ratio = np.full((len(axes), 1), (1 + shape.stretch) / 2)
-    return PatchNodes(fractions, stretch * vector_m, area, pressure, np.exp(own), ratio)
+    ratio = np.full((k, 1), (1 + shape.stretch) / 2)
+    return PatchNodes(fractions, form.stretch * vector_m, area, pressure, own_m, ratio)
+
+
+def _is_over_edge(middle: FloatArray, to_fractions: FloatArray, profile: _Profile) -> NDArray[np.bool_]:
+    """Return which patches (k,) reach beyond the pad; parameters as in `_points_on_pad`."""
+    beyond = np.abs(middle[:, :, None] + to_fractions @ profile.centre - 0.5)
+    reach = profile.radius * np.sqrt((to_fractions**2).sum(axis=2))
+    return np.asarray((beyond + reach[:, :, None] > 0.5).any(axis=(1, 2)))
 
 
 def _points_on_pad(
-    middle: FloatArray, to_fractions: FloatArray, profile: _Profile
+    middle: FloatArray, to_fractions: FloatArray, profile: _Profile, over: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points (k, 2, NODES) of the unit disc that stand for the part of patches on the pad.
 
     Second: by what they are nearer to each other along x and y than on the whole patch, (k, 2, NODES).
-    middle: (k, 2) of the patches, fractions of the pad. to_fractions: (k, 2, 2), from the unit disc.
+    middle: (k, 2) of the patches, fractions of the pad. to_fractions: (k, 2, 2), from the unit disc. over:
+    (k,), those that reach beyond the pad.
     """
     point = np.repeat(profile.point[None], len(middle), axis=0)
     squeeze = np.ones_like(point)
     centres = middle[:, :, None] + to_fractions @ profile.centre
     square = profile.radius**2 * to_fractions @ to_fractions.transpose(0, 2, 1)
-    reach = np.sqrt(square[:, [0, 1], [0, 1]])[:, :, None]
-    over = ((centres - reach < 0) | (centres + reach > 1)).any(axis=(1, 2))
     for k in np.flatnonzero(over).tolist():
         at = middle[k, :, None] + to_fractions[k] @ profile.point
         for axis in (0, 1):  # nodes of a chord of their part move to what of it is on the pad

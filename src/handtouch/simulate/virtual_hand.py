@@ -201,7 +201,11 @@ class VirtualHand:
         force = np.array([contact.contact.force_n for contact in contacts])
         times_s = np.array([t_s])
         pads = [self.virtual_pads[contact.row] for contact in contacts]
-        force = force * [1.0 if pad.is_ideal else pad.force_ratio(times_s)[0] for pad in pads]
+        on_pad = np.bincount(rows, force)[rows]
+        force = force * [
+            1.0 if pad.is_ideal else pad.force_ratio(times_s, None if pad.faults else on_pad[[k]])[0]
+            for k, pad in enumerate(pads)
+        ]
         return self.solve_contacts(rows, position, patch, force)
 
     def solve_contacts(

@@ -160,13 +160,13 @@ class VirtualPad:
         """True if apparent and true force are always the same."""
         return self.sheet_law is None and self.drift.is_constant and not self.faults
 
-    def force_ratio(self, times_s: FloatArray) -> FloatArray:
-        """Return apparent over true force (n,)."""
+    def force_ratio(self, times_s: FloatArray, total_force_n: FloatArray | None = None) -> FloatArray:
+        """Return apparent over true force (n,); total_force_n: as in `SimulatedSheetHistory.force_ratio`."""
         if self.is_ideal:
             return np.ones(len(times_s))
         if self.history is None:
             return np.asarray(1 + _IDEAL_SHEET_GAIN_PER_K * self._temperature_rise_k(times_s))
-        return self.history.force_ratio(times_s)
+        return self.history.force_ratio(times_s, total_force_n)
 
     @cached_property
     def history(self) -> SimulatedSheetHistory | None:
