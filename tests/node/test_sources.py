@@ -136,7 +136,7 @@ def test_each_line_is_read_once_and_the_newest_of_several(board: Board, clock: C
         assert reading is not None
         assert reading.raw.tolist() == [9, 10, 11, 12]
         assert (reading.is_timed, reading.span_ns) == (False, 7 * MS)
-        assert (reader.lines, reader.malformed_lines) == (3, 0)
+        assert (reader.samples, reader.malformed) == (3, 0)
     finally:
         reader.close()
 
@@ -190,7 +190,7 @@ def test_datagrams_are_lines(clock: Clock) -> None:
             for text in (b"0,0,0,0", b"1,2,3,4", b"5,6,7,8\n"):
                 sender.sendto(text, ("127.0.0.1", port))
             assert read_lines(reader) == [5, 6, 7, 8]
-            assert (reader.lines, reader.malformed_lines) == (2, 0)  # the first may be the rest of one
+            assert (reader.samples, reader.malformed) == (2, 0)  # the first may be the rest of one
     finally:
         reader.close()
 
@@ -268,7 +268,7 @@ def test_malformed_frames_are_counted_and_silence_names_the_frame(
         with pytest.raises(AdcError, match="TIP_A") as error:
             reader.read()
         assert "TIP_B" not in str(error.value)
-        assert reader.malformed_frames == 1
+        assert reader.malformed == 1
     finally:
         reader.close()
 

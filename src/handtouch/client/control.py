@@ -140,14 +140,14 @@ class DaemonControl:
     def status(self) -> DaemonStatus:
         """Return the daemon's state, that of every pad, and the scenes."""
         answer = self._request("status")
-        pads = tuple(_from_map(wire.Health, pad) for pad in answer["pads"])
-        return DaemonStatus(_from_map(wire.Service, answer["service"]), pads, answer["scene"])
+        pads = tuple(wire.from_map(wire.Health, pad) for pad in answer["pads"])
+        return DaemonStatus(wire.from_map(wire.Service, answer["service"]), pads, answer["scene"])
 
     def snapshot(self) -> Snapshot:
         """Return all hands and contacts now."""
         answer = self._request("snapshot")
-        hands = {hand: _from_map(wire.HandFrame, frame) for hand, frame in answer["hands"].items()}
-        return Snapshot(hands, tuple(_from_map(wire.Contact, contact) for contact in answer["contacts"]))
+        hands = {hand: wire.from_map(wire.HandFrame, frame) for hand, frame in answer["hands"].items()}
+        return Snapshot(hands, tuple(wire.from_map(wire.Contact, contact) for contact in answer["contacts"]))
 
     def tare(self, *pads: str) -> list[TareResult]:
         """Zero pads, by default all; takes a second. A loaded pad isn't tared, see `reason`."""
@@ -225,7 +225,3 @@ def _list(values: Sequence[Any] | None) -> list[Any] | None:
     if isinstance(values, str):
         raise ValueError(f"{values!r} is one string; give a list, [{values!r}]")
     return None if values is None else list(values)
-
-
-def _from_map(kind: type[M], payload: Mapping[str, Any]) -> M:
-    return kind(**wire.check_fields(kind.__name__, payload, kind))

@@ -22,11 +22,17 @@ FILE_OWNER, CONTROL_OWNER = "the deployment file", "control"
 MAX_CLIENTS = 32
 MAX_CLIENT_CHARACTERS = 32_768
 """Length of the patterns of all clients' scenes, and of their names once for each pad: answers have them"""
-_TYPICAL_PADS = 15
+_USUAL_PADS = 15  # of the paper's hand
 _MAX_SUBSCRIPTIONS = 8
 """Subscriptions that are named for each pad"""
 BoolArray = NDArray[np.bool_]
 _OUTPUTS = ("position", "force", "raw", "palm", "base", *PERCEPT_KINDS)
+
+
+def scaled_limit(limit: int, pads: int) -> int:
+    """Return a limit that holds for the paper's hand for this number of pads: for more of them in proportion
+    higher."""
+    return limit * max(pads, _USUAL_PADS) // _USUAL_PADS
 
 
 class SceneRequirements(NamedTuple):
@@ -125,7 +131,7 @@ class ActiveScenes:
         patterns = {name: held.scene.links for name, (held, _) in self._clients.items()} | {client: links}
         pads = len(self.names)
         size = sum(len("".join(links)) + pads * len(name) for name, links in patterns.items())
-        limit = MAX_CLIENT_CHARACTERS * max(pads, _TYPICAL_PADS) // _TYPICAL_PADS
+        limit = scaled_limit(MAX_CLIENT_CHARACTERS, pads)
         if size > limit:
             raise ValueError(
                 f"the patterns of all clients' scenes, and their names for each pad, have {size} characters, "

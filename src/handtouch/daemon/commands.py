@@ -25,11 +25,10 @@ from handtouch.config.tables import RequestedOutput, SceneRequest
 from handtouch.core.events import BaselineEvent, EvidenceEvent
 from handtouch.core.pad_patterns import PATTERNS_PER_PAD
 from handtouch.core.pipeline import Pipeline
-from handtouch.core.scene import Demand
+from handtouch.core.scene import Demand, scaled_limit
 from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
     MAX_REPLY_BYTES,
-    MAX_REPLY_PADS,
     Command,
     Job,
     JobCommand,
@@ -151,7 +150,7 @@ class ControlCommands:
         if self._status_ns is None or now_ns - self._status_ns >= STATUS_AGE_NS:
             self._status_ns = now_ns
             self._status_reply = {**self._reporter.status(now_ns), "scene": self._scene_reply(now_ns)}
-            limit = MAX_REPLY_BYTES * max(len(self._pad_names), MAX_REPLY_PADS) // MAX_REPLY_PADS
+            limit = scaled_limit(MAX_REPLY_BYTES, len(self._pad_names))
             if len(msgpack.packb(self._status_reply)) > limit - _ENVELOPE_BYTES:
                 self._status_reply["scene"] = {"scenes": [], "pads": []}
         return {**self._status_reply, "now_ns": time.monotonic_ns()}

@@ -27,8 +27,7 @@ MAX_JOBS = 8
 MAX_JOBS_PER_CLIENT = 2
 """Jobs of one connection in progress at a time"""
 MAX_REPLY_BYTES = 65_536
-"""Longest reply for a hand of MAX_REPLY_PADS; for more pads longer in proportion"""
-MAX_REPLY_PADS = 15
+"""Longest reply for the paper's hand; for more pads longer, see `core.scene.scaled_limit`"""
 LOOP_FRACTION = 0.05
 """Largest fraction of time for answering requests, on average"""
 _MAX_SAVED_NS = 500_000

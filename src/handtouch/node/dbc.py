@@ -19,8 +19,8 @@ from handtouch.canbus.bus.receivers import arrival_ns
 from handtouch.config.problems import suggest_name
 from handtouch.config.tables import Bus
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
-from handtouch.node.iio import AdcReading, FloatArray
-from handtouch.node.source import Source
+from handtouch.node.iio import AdcReading
+from handtouch.node.source import Source, SourceReader
 
 if TYPE_CHECKING:
     from cantools.database import Database, Message, Signal
@@ -98,28 +98,24 @@ def _find_signal(database: Database, channel: str) -> tuple[Message, Signal]:
     raise ValueError(f"{suggest_name(channel, known)}the file has {shown or 'no signal'}")
 
 
-class DbcReader:
+class DbcReader(SourceReader):
     """Reads the signals of one pad: a sample is complete when each of their messages has come since the last.
 
-    Times are the kernel's receive stamps. `malformed_frames`: of a known identifier and no such signals.
-    Implements `AdcReader`.
+    Times are the kernel's receive stamps; malformed are frames of a known identifier without such signals.
     """
+
+    unit: ClassVar[str] = "frames"
 
     def __init__(
         self, source: DbcSource, channels: Sequence[str], path: Path, clock: Callable[[], int]
     ) -> None:
-        self._source, self._path, self._clock = source, path, clock
-        self._channels = tuple(channels)
-        self.limits = source.limit_rows(channels)
-        self.millivolts = np.ones(len(channels)), np.zeros(len(channels))
-        self.samples = self.malformed_frames = 0
+        super().__init__(source, channels, clock)
+        self._source, self._path = source, path
         self._bus: can.BusABC | None = None
         self._messages: dict[tuple[int, bool], Message] = {}
         self._places: dict[tuple[int, bool], list[tuple[int, str]]] = {}
         self._values = np.zeros(len(channels))
         self._stamps_ns: dict[tuple[int, bool], int] = {}
-        self._newest: tuple[FloatArray, int, int] | None = None
-        self._sample_ns = 0
 
     def open(self) -> None:
         """Open the bus with a filter for the pad's messages. Raises AdcError."""
@@ -147,22 +143,7 @@ class DbcReader:
             ]
             self._bus.set_filters(filters)
         self._stamps_ns.clear()
-        self._newest, self._sample_ns = None, self._clock()
-
-    def read(self) -> AdcReading | None:
-        """Return the newest sample if there is a new one. Raises AdcError after a silence."""
-        self.drain()
-        now_ns = self._clock()
-        if self._newest is not None:
-            (values, sample_ns, span_ns), self._newest = self._newest, None
-            return AdcReading(values, sample_ns, span_ns)
-        if now_ns - self._sample_ns <= self._source.max_silence_ns:
-            return None
-        missing = [message.name for key, message in self._messages.items() if key not in self._stamps_ns]
-        text = f"{self._source.channel}: no frame {', '.join(missing)} for "
-        text += f"{self._source.max_silence_ns / 1e6:g} ms"
-        text += f"; {self.malformed_frames} frames had another length" if self.malformed_frames else ""
-        raise AdcError(AdcFaultKind.NO_CONVERSION, text)
+        self._begin()
 
     def drain(self) -> None:
         """Read the frames that have arrived. Raises AdcError."""
@@ -185,7 +166,11 @@ class DbcReader:
 
     def describe(self) -> str:
         """Return the samples so far, for the log."""
-        return f"{self.samples} samples, {self.malformed_frames} malformed frames"
+        return f"{self.samples} samples, {self.malformed} malformed frames"
+
+    def _missing(self) -> str:
+        missing = [message.name for key, message in self._messages.items() if key not in self._stamps_ns]
+        return f"{self._source.channel}: no frame {', '.join(missing)}"
 
     def _take(self, frame: can.Message) -> None:
         key = frame.arbitration_id, frame.is_extended_id
@@ -196,7 +181,7 @@ class DbcReader:
             decoded: Any = message.decode(bytes(frame.data), decode_choices=False)
             found = [(row, float(decoded[name])) for row, name in self._places[key] if name in decoded]
         except Exception:  # noqa: BLE001 - cantools and bitstruct raise several kinds for short frames
-            self.malformed_frames += 1
+            self.malformed += 1
             return
         for row, value in found:  # a multiplexed signal comes in another frame of this message
             self._values[row] = value
@@ -208,10 +193,8 @@ class DbcReader:
         if len(self._stamps_ns) < len(self._messages):
             return
         first_ns = min(self._stamps_ns.values())
-        self._newest = self._values.copy(), last_ns, last_ns - first_ns
-        self._sample_ns = self._clock()
+        self._keep(AdcReading(self._values.copy(), last_ns, last_ns - first_ns))
         self._stamps_ns.clear()
-        self.samples += 1
 
 
 def _signal_limits(signal: Signal) -> tuple[float, float]:

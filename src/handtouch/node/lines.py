@@ -14,7 +14,7 @@ import re
 import socket
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -22,7 +22,7 @@ from pydantic import Field, field_validator
 
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
 from handtouch.node.iio import AdcReading
-from handtouch.node.source import Source
+from handtouch.node.source import Source, SourceReader
 
 MAX_LINE_BYTES = 4096
 _MAX_READ_BYTES = 65_536  # at a time: more than comes between two readings
@@ -106,45 +106,29 @@ class _Stream(Protocol):
     def close(self) -> None: ...
 
 
-class LinesReader:
-    """Reads the newest line; each line is one sample, so that an old one is never taken for new.
+class LinesReader(SourceReader):
+    """Reads the newest line; each line is one sample.
 
-    `lines`, `malformed_lines`: since the start. A line's time is that of reading it, which is after the
-    reading before. Implements `AdcReader`.
+    A line's time is that of reading it, which is after the reading before.
     """
 
+    unit: ClassVar[str] = "lines"
+
     def __init__(self, source: LinesSource, channels: Sequence[str], clock: Callable[[], int]) -> None:
-        self._source, self._channels, self._clock = source, tuple(channels), clock
-        self.limits = source.limit_rows(channels)
-        self.millivolts = np.ones(len(channels)), np.zeros(len(channels))
-        self.lines = self.malformed_lines = 0
+        super().__init__(source, channels, clock)
+        self._url, self._baud = source.url, source.baud
         self._stream: _Stream | None = None
         self._rest = b""
         self._skips_line = False
-        self._newest: list[float] | None = None
-        self._line_ns = self._drained_ns = 0
+        self._drained_ns = 0
 
     def open(self) -> None:
         """Open the source. Raises AdcError."""
-        self._stream = _open_stream(self._source)
-        self._rest, self._newest = b"", None
-        self._skips_line = self._source.url != "-"  # the first may be the rest of one
-        self._line_ns = self._drained_ns = self._clock()
-
-    def read(self) -> AdcReading | None:
-        """Return the newest line's values if there is a new one. Raises AdcError after a silence."""
-        before_ns = self._drained_ns
-        self.drain()
-        now_ns = self._drained_ns
-        if self._newest is None:
-            if now_ns - self._line_ns <= self._source.max_silence_ns:
-                return None
-            text = f"{self._source.url}: no line with {', '.join(self._channels)} for "
-            text += f"{self._source.max_silence_ns / 1e6:g} ms"
-            text += f"; {self.malformed_lines} lines were anything else" if self.malformed_lines else ""
-            raise AdcError(AdcFaultKind.NO_CONVERSION, text)
-        values, self._newest = np.array(self._newest), None
-        return AdcReading(values, now_ns, now_ns - before_ns, is_timed=False)
+        self._stream = _open_stream(self._url, self._baud)
+        self._rest = b""
+        self._skips_line = self._url != "-"  # the first may be the rest of one
+        self._begin()
+        self._drained_ns = self._clock()
 
     def drain(self) -> None:
         """Read what has arrived, keeping the newest line. Raises AdcError."""
@@ -153,8 +137,8 @@ class LinesReader:
         try:
             data = self._stream.read()
         except OSError as error:
-            raise _failure(self._source.url, error) from error
-        self._drained_ns = self._clock()
+            raise _failure(self._url, error) from error
+        before_ns, self._drained_ns = self._drained_ns, self._clock()
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE_BYTES:
             self._rest, self._skips_line = b"", True
@@ -163,7 +147,7 @@ class LinesReader:
             if self._skips_line:
                 self._skips_line = False
             elif line.strip():
-                self._take(line)
+                self._take(line, self._drained_ns - before_ns)
 
     def close(self) -> None:
         """Close the source."""
@@ -173,22 +157,24 @@ class LinesReader:
 
     def describe(self) -> str:
         """Return the lines so far, for the log."""
-        return f"{self.lines} lines, {self.malformed_lines} malformed"
+        return f"{self.samples} lines, {self.malformed} malformed"
 
-    def _take(self, line: bytes) -> None:
+    def _missing(self) -> str:
+        return f"{self._url}: no line with {', '.join(self._channels)}"
+
+    def _take(self, line: bytes, span_ns: int) -> None:
         values = parse_line(line, self._channels)
         if values is None:
             self._count_malformed(line)
-            return
-        self.lines += 1
-        self._newest, self._line_ns = values, self._drained_ns
+        else:
+            self._keep(AdcReading(np.array(values), self._drained_ns, span_ns, is_timed=False))
 
     def _count_malformed(self, line: bytes) -> None:
-        self.malformed_lines += 1
-        if math.log10(self.malformed_lines).is_integer():
+        self.malformed += 1
+        if math.log10(self.malformed).is_integer():
             _log.warning(
                 "%s: %d lines without numbers for channels %s, the last: %r",
-                self._source.url, self.malformed_lines, ", ".join(self._channels), line[:80],
+                self._url, self.malformed, ", ".join(self._channels), line[:80],
             )  # fmt: skip
 
 
@@ -258,14 +244,13 @@ class _SerialPort:
         self._port.close()
 
 
-def _open_stream(source: LinesSource) -> _Stream:
-    url = source.url
+def _open_stream(url: str, baud: int) -> _Stream:
     try:
         if url == "-":
             return _StandardInput()
         if url.startswith("udp:"):
             return _Datagrams(*_host_and_port(url))
-        return _SerialPort(url, source.baud)
+        return _SerialPort(url, baud)
     except OSError as error:
         raise _failure(url, error) from error
 

@@ -22,7 +22,7 @@ from handtouch import wire
 from handtouch.client.window import HandWindow
 from handtouch.learn import TouchFeatures
 from handtouch.learn.features import Frame
-from handtouch.record.recording import RecordedMessage, Recording
+from handtouch.record.recording import Recording
 
 TOUCH, WINDOW, STATE = "observation.touch", "observation.touch_window", "observation.state"
 _VERSION, _CHUNK_FILES = "v3.0", 1000
@@ -144,7 +144,7 @@ def _episodes(recording: Recording, hand: str, joints: Sequence[str], max_gap_s:
                 episode.joints_ns.append(payload["t_ns"])
                 episode.positions.append([values[name] for name in joints])
             continue
-        frame = _frame_of(entry)
+        frame = wire.from_map(wire.HandFrame, entry.payload, entry.topic)
         last = episode.frames[-1] if episode.frames else frame
         changed = (frame.session, frame.links) != (last.session, last.links)
         if changed or frame.t_ns - last.t_ns > 1e9 * max_gap_s:
@@ -155,10 +155,6 @@ def _episodes(recording: Recording, hand: str, joints: Sequence[str], max_gap_s:
             episode.frames.append(frame)
     if episode.frames:
         yield episode
-
-
-def _frame_of(entry: RecordedMessage) -> wire.HandFrame:
-    return wire.HandFrame(**wire.check_fields(entry.topic, entry.payload, wire.HandFrame))
 
 
 def _columns_of(

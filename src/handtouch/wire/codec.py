@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from functools import cache
 from operator import attrgetter
-from typing import Any, Literal, NamedTuple, Union
+from typing import Any, Literal, NamedTuple, TypeVar, Union
 
 import msgpack
 
@@ -25,6 +25,7 @@ from handtouch.wire.topics import (
     topic_of,
 )
 
+M = TypeVar("M")
 SCHEMA_VERSION = 1
 """Rules for raising it: docs/wire.md, "Versions"."""
 
@@ -70,6 +71,14 @@ def encode(message: OutgoingMessage) -> list[bytes]:
     return [topic_of(message).encode(), _PACKER.pack(to_map(message))]
 
 
+def from_map(kind: type[M], payload: Mapping[str, Any], where: str = "") -> M:
+    """Return the message of a map, of any layout that has its fields.
+
+    Raises WireError, naming `where` it came from, by default its kind.
+    """
+    return kind(**check_fields(where or kind.__name__, payload, kind))
+
+
 def to_map(message: OutgoingMessage) -> dict[str, Any]:
     """Return the map that is sent for a message."""
     if isinstance(message, EncodedMessage):
@@ -92,7 +101,7 @@ def decode(parts: Sequence[bytes]) -> Message:
     """
     received = unpack(parts, _TOPIC_OF_PREFIX)
     topic, payload = received.topic, received.payload
-    message = topic.payload(**check_fields(received.name, payload, topic.payload))
+    message = from_map(topic.payload, payload, received.name)
     if "links" in payload:
         _check_columns(received.name, message)
     if topic_of(message) != received.name:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 from handtouch.canbus import cia301
 from handtouch.canbus.nodes.spec import Identity, IdleSettings, NodeSpec
@@ -49,10 +48,13 @@ class NodeConfigured:
     """it is sent by its event timer, not with SYNC"""
 
 
-def read_identity(sdo: NodeSdoClient) -> Identity:
-    """Read 0x1018."""
-    first, *further = cia301.IDENTITY_NAMES.values()
-    optional = (sdo.read_if_present(cia301.IDENTITY, sub, name) for sub, name in enumerate(further, 2))
+def read_identity(sdo: NodeSdoClient, expected: NodeSpec | None = None) -> Identity:
+    """Read 0x1018; raises BootStepError where the node doesn't answer what is expected."""
+    (_, first), *further = cia301.IDENTITY_NAMES.items()
+    optional = (
+        sdo.read_if_present(cia301.IDENTITY, sub, name, needed=getattr(expected, key, None) is not None)
+        for sub, (key, name) in enumerate(further, 2)
+    )
     return Identity(sdo.read(cia301.IDENTITY, 1, first), *optional)
 
 
@@ -62,12 +64,7 @@ def identify_node(sdo: NodeSdoClient, expected: NodeSpec) -> Identification:
     Raises BootStepError where the node doesn't answer what tells whether it is the expected one: it may be
     busy, or frames may be lost.
     """
-    identity = read_identity(sdo)
-    for sub, (key, name) in enumerate(cia301.IDENTITY_NAMES.items(), 1):
-        if getattr(identity, key) is None and getattr(expected, key) is not None:
-            again: dict[str, Any] = {key: sdo.read_or_none(cia301.IDENTITY, sub, name)}
-            identity = replace(identity, **again)
-    return Identification(identity, read_errors(sdo))
+    return Identification(read_identity(sdo, expected), read_errors(sdo))
 
 
 def check_identity(identity: Identity, expected: NodeSpec) -> None:

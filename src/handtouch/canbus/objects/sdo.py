@@ -272,9 +272,12 @@ class NodeSdoClient:
                 return None
             raise
 
-    def read_if_present(self, index: int, sub: int, name: str) -> int | None:
+    def read_if_present(self, index: int, sub: int, name: str, needed: bool = False) -> int | None:
         """Read an object that CiA 301 doesn't require; None if the node refuses, or answers everything but
-        it."""
+        it.
+
+        With `needed` a second time-out raises: the node may be busy.
+        """
         try:
             return self.read_or_none(index, sub, name)
         except BootStepError as error:
@@ -283,7 +286,7 @@ class NodeSdoClient:
         try:  # a second time: frames may have been lost
             return self.read_or_none(index, sub, name)
         except BootStepError as error:
-            if error.timed_out:
+            if error.timed_out and not needed:
                 return None
             raise
 
