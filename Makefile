@@ -100,11 +100,13 @@ types: $(VENV)/.dev ## check static types
 docs: $(VENV)/.dev ## build the documentation in docs/_build; warnings are errors
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build
 
-tables: $(VENV)/.dev ## write from the code what is generated of messages (docs/wire_files.py lists it), configuration.md and firmware.md
+tables: $(VENV)/.dev ## write from the code what is generated of messages (docs/wire_files.py lists it), of configuration and of firmware
 	$(BIN)/python -m docs.wire_files
 	$(BIN)/python docs/firmware_tables.py
 	@mkdir -p build
 	$(BIN)/python docs/configuration_page.py >build/configuration.md && mv build/configuration.md docs/configuration.md
+	$(BIN)/handtouch check --schema >build/schema.json && mv build/schema.json config/handtouch.schema.json
+	$(BIN)/handtouch node --schema >build/schema.json && mv build/schema.json config/touch_node.schema.json
 
 wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg

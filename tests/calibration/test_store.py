@@ -41,6 +41,7 @@ from handtouch.calibration.store import (
     store_path,
 )
 from handtouch.calibration.store_file import SCHEMA_VERSION
+from handtouch.config import load, shipped
 
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)
 CONFIG = "nominal-0123456789ab"
@@ -493,5 +494,21 @@ def test_default_path_of_the_store(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     assert store_path() == tmp_path / "state/handtouch/calibrations.db"
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/handtouch/right")
     assert store_path() == Path("/var/lib/handtouch/right/calibrations.db")
-    assert store_path("cal.db", tmp_path) == tmp_path / "cal.db"
-    assert store_path("/srv/cal.db", tmp_path) == Path("/srv/cal.db")
+    deployment = load(shipped.path("two_finger.toml"))
+    named = [
+        deployment.model_copy(update={"daemon": deployment.daemon.model_copy(update={"store": name})})
+        for name in ("cal.db", "/srv/cal.db")
+    ]
+    assert [store_path(one, tmp_path) for one in named] == [tmp_path / "cal.db", Path("/srv/cal.db")]
+
+
+@pytest.mark.parametrize(
+    ("bus", "name"),
+    [("socketcan:can0", "calibrations.db"), ("udp_multicast:239.74.163.2", "simulated.db")],
+)
+def test_simulated_nodes_have_a_store_of_their_own(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, bus: str, name: str
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    deployment = load(shipped.path("two_finger.toml"), [f"can0={bus}"])
+    assert store_path(deployment) == tmp_path / name

@@ -95,7 +95,7 @@ def test_shipped_pads_have_moderate_aspect_ratios() -> None:
 
 def test_shipped_schema_is_current() -> None:
     kept = json.loads((CONFIG / "handtouch.schema.json").read_text())
-    assert kept == config.json_schema(), "run `make schema`"
+    assert kept == config.json_schema(), "run `make tables`"
 
 
 # --- every mistake is named: file, section, key, value, and what would be right

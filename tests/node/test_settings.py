@@ -75,7 +75,7 @@ def test_trim_files_are_read_and_checked(bench: Any) -> None:
 
 def test_shipped_schema_and_example_are_current() -> None:
     kept = json.loads((CONFIG / "touch_node.schema.json").read_text())
-    assert kept == json_schema(), "run `make schema`"
+    assert kept == json_schema(), "run `make tables`"
     assert [pad.node_id for pad in load(CONFIG / "touch_node.toml").settings.pads] == [1, 2]
 
 

@@ -266,7 +266,7 @@ def _run_with_store(
     if store is None:
         loaded = None if deployment is None else config.load(deployment)
         beside = None if deployment is None else deployment.parent
-        store = store_path(None if loaded is None else loaded.daemon.store, beside)
+        store = store_path(loaded, beside)
     with Store(store, create=create) as opened:
         return action(opened)
 

@@ -97,6 +97,8 @@ class PadCalibration(TypedDict):
     gains: list[float]
     offset_counts: list[float]
     law: LawValues
+    store: str | None
+    """path of the calibration store that the daemon reads; None without supervisor"""
 
 
 class ReloadResult(TypedDict):

@@ -7,7 +7,7 @@ follow one of several models.
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -68,7 +68,8 @@ class Daemon(Table):
         None,
         min_length=1,
         description="calibration store, relative to this file; default: "
-        "$XDG_STATE_HOME/handtouch/calibrations.db, or in the service's state folder",
+        "$XDG_STATE_HOME/handtouch/calibrations.db, or in the service's state folder; simulated.db there for "
+        "nodes on a bus of udp_multicast or virtual",
         examples=["calibrations.db"],
     )
     supervise: bool = Field(
@@ -108,6 +109,10 @@ class Daemon(Table):
     )
 
 
+CABLELESS_INTERFACES: Final = frozenset({"udp_multicast", "virtual"})
+"""Interfaces of python-can that connect programs."""
+
+
 class Bus(Table):
     """`[[bus]]`: one CAN bus, in python-can's terms."""
 
@@ -130,6 +135,11 @@ class Bus(Table):
         description="further options of the python-can interface, passed on unchanged",
         examples=[{"port": 43114}],
     )
+
+    @property
+    def is_cableless(self) -> bool:
+        """True if the bus is between programs, without a cable that may be at fault."""
+        return self.interface in CABLELESS_INTERFACES
 
 
 class Idle(Table):

@@ -242,6 +242,7 @@ class ControlCommands:
                 offsets or pipeline.tick.baseline.expected_counts[pad, : self._channels(pad)].tolist()
             ),
             "law": {key: getattr(law, key) for key in _LawArguments.model_fields},
+            "store": None if self._reporter.supervisor is None else self._reporter.supervisor.store,
         }
 
     def _apply_calibration(self, pad: int, request: _CalibrateArguments, name: str) -> None:

@@ -197,7 +197,7 @@ class HandtouchDaemon(Closing):
             self.deployment,
             self.pipeline,
             self.master,
-            str(store_path(settings.store, folder)),
+            str(store_path(self.deployment, folder).absolute()),
             on_excitation_changed=self._apply_excitation,
         )
         self._stack.callback(supervisor.close)

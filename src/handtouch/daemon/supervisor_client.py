@@ -63,7 +63,8 @@ _log = logging.getLogger("handtouch.supervisor")
 class SupervisorClient:
     """Call `process_tick` after every tick, and `handle_node_events` with the events of nodes. Times in ns.
 
-    `assessments`: the latest assessment of each pad by the supervisor process, None before the first.
+    `store`: path of the calibration store. `assessments`: the latest assessment of each pad by the supervisor
+    process, None before the first.
     `malformed` counts its invalid messages, `late` those about a node that has been replaced since.
     `on_excitation_changed` is called with the time when `excitation.off` has changed.
     """
@@ -78,7 +79,7 @@ class SupervisorClient:
         on_excitation_changed: Callable[[int], None] = lambda _: None,
     ) -> None:
         self._pipeline, self._master = pipeline, master
-        self._store = store
+        self.store = store
         self._set_deployment(deployment)
         self.process = process or ChildProcess(
             "handtouch.supervisor.child",
@@ -246,7 +247,7 @@ class SupervisorClient:
 
     def _set_deployment(self, deployment: Deployment) -> None:
         """Set the deployment, with the path of the store, that the supervisor process gets when it starts."""
-        daemon = deployment.daemon.model_copy(update={"store": self._store})
+        daemon = deployment.daemon.model_copy(update={"store": self.store})
         self.deployment, self._pads = deployment.model_copy(update={"daemon": daemon}), deployment.pads
 
     def _send_serials(self, now_ns: int) -> None:

@@ -31,15 +31,14 @@ from handtouch.canbus.bus.receivers import (
 from handtouch.canbus.bus.router import BusCounters, CanFrame, Router
 from handtouch.canbus.bus.sockets import DatagramReceiver, SocketcanReceiver
 from handtouch.config import Bus
+from handtouch.config.tables import CABLELESS_INTERFACES
 from handtouch.core.slab import Slab
 from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
 
 _SEND_ATTEMPTS, _SEND_RETRY_S = 100, 0.002
 _ECHOING_INTERFACES = frozenset({"udp_multicast"})
 """Interfaces on which sent frames are received, and counted, again."""
-_CABLELESS_INTERFACES = frozenset({"udp_multicast", "virtual"})
-"""python-can's interfaces between programs"""
-_INTERFACES_WITHOUT_BITRATE = frozenset({"socketcan", "udp_multicast", "virtual"})
+_INTERFACES_WITHOUT_BITRATE = CABLELESS_INTERFACES | {"socketcan"}
 """Interfaces whose bit rate python-can can't set."""
 
 
@@ -107,7 +106,7 @@ class Port:
     @property
     def is_cableless(self) -> bool:
         """True if the bus is between programs, without a cable that may be at fault."""
-        return self.bus.interface in _CABLELESS_INTERFACES
+        return self.bus.is_cableless
 
     @property
     def problem(self) -> str:

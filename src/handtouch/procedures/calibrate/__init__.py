@@ -14,6 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 from handtouch import config
+from handtouch.calibration.store import store_path
 from handtouch.core.pad_model import default_calibration_id_of, law_of
 from handtouch.host.installation import extra_command
 from handtouch.procedures.calibrate import plot, report
@@ -92,7 +93,8 @@ def refit_recording(options: CalibrateOptions, file: Path, now: datetime) -> Cal
     result = job.fit_readings(readings, header.radius_std)
     if not options.yes or not options.store or result.report.fit.problems:
         return result
-    stored = store_law(options.config, job.deployment, job.entry, header, result.report, now)
+    store = store_path(job.deployment, options.config.parent)
+    stored = store_law(store, job.entry, header, result.report, now)
     line = f"stored as {stored}; a daemon that uses this store applies it within seconds"
     return CalibrationResult(result.report, (*result.lines, line), stored)
 
@@ -207,7 +209,8 @@ def _run_procedure(
         reason = "its node has no serial number to bind it to" if job.options.store else "--no-store"
         dialogue.print_line(f"Not stored ({reason}): applied until the daemon ends.", "bad")
     else:
-        stored = store_law(job.options.config, job.deployment, job.entry, header(), result.report, clock())
+        store = served.store or store_path(job.deployment, job.options.config.parent)
+        stored = store_law(store, job.entry, header(), result.report, clock())
         dialogue.print_line(f"Stored as {stored}.", "good")
     applied = served.apply_law(stored or "guided", result.report.fit.law)
     dialogue.print_line(f"{job.name}: calibration {applied} is active.", "good")

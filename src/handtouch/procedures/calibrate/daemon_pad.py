@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Self
 
 from handtouch import client, wire
@@ -34,8 +35,8 @@ class ServedPad:
     """The pad `hand`/`link` of a daemon; use it in a `with` block, in which a scene keeps the pad active.
 
     `active_calibration`: the daemon's answer to `calibrate`. `serial`: of the node, None until known or if
-    there is none. `tare_offsets`: mean counts and their variances (4,) of the last tare. Raises what
-    `client.request` does.
+    there is none. `tare_offsets`: mean counts and their variances (4,) of the last tare. `store`: that which
+    the daemon reads, None without. Raises what `client.request` does.
     """
 
     def __init__(self, endpoints: DaemonEndpoints, hand: str, link: str) -> None:
@@ -43,12 +44,15 @@ class ServedPad:
         self.active_calibration: dict[str, Any] = {}
         self.serial: int | None = None
         self.tare_offsets: tuple[list[float], list[float]] | None = None
+        self.store: Path | None = None
         self._endpoints, self._hand, self._link = endpoints, hand, link
         self._sync_ns = 0
         self._lease_renewed_s = -math.inf
 
     def __enter__(self) -> Self:
         self.active_calibration = self._request("calibrate", pad=self.name)
+        if path := self.active_calibration.get("store"):  # of a daemon that may run as another user
+            self.store = Path(path)
         self._renew_lease()
         self._messages = client.connect(
             f"hand/{self._hand}",

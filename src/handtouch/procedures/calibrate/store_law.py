@@ -17,7 +17,7 @@ from handtouch.calibration.calibration import (
     Provenance,
     channel_values,
 )
-from handtouch.calibration.store import Store, StoreError, store_path
+from handtouch.calibration.store import Store, StoreError
 from handtouch.host.user import user_name
 from handtouch.procedures.calibrate.recording import RecordingHeader
 from handtouch.procedures.calibrate.report import CalibrationReport
@@ -27,13 +27,12 @@ METHOD = "guided session"
 
 def store_law(
     path: Path,
-    deployment: config.Deployment,
     pad: config.NamedPad,
     header: RecordingHeader,
     report: CalibrationReport,
     now: datetime,
 ) -> str:
-    """Store the law measured on a pad of a hand of the deployment at `path`; return its calibration_id.
+    """Store the law measured on a pad in the store at `path`; return its calibration_id.
 
     Gains and sheet state of the newest version stay, if they are this node's under these tables; offsets are
     those of the tare. Raises StoreError, also for a node without a serial number.
@@ -55,7 +54,7 @@ def store_law(
         f"{'' if fit.sheet_observed else 'not '}observed; radius "
         f"{'constant' if fit.law.hertz_force_n is None else 'by Hertz'}, evidence {fit.evidence:+.1f}",
     )
-    with Store(store_path(deployment.daemon.store, path.parent)) as store:
+    with Store(path) as store:
         newest = store.newest(header.serial, header.default_calibration_id)
         own = (
             newest is not None

@@ -95,7 +95,8 @@ export function drawPercepts({ scene, percepts, percepts_enabled: enabled }) {
   const order = new Map(scene.pads.map((pad, number) => [pad.key, number]));
   const entries = Object.entries(percepts).filter(([, summary]) => summary);
   entries.sort(([a], [b]) => (order.get(a) ?? -1) - (order.get(b) ?? -1)); // whole hands first
-  const nameOf = (key) => (key.endsWith("/") ? `${key.slice(0, -1)} hand` : key.slice(key.indexOf("/") + 1).replaceAll("_", " "));
+  const names = new Map(scene.pads.map((pad) => [pad.key, pad.name]));
+  const nameOf = (key) => (key.endsWith("/") ? `${key.slice(0, -1)} hand` : (names.get(key) ?? key).replaceAll("_", " "));
   const known = ([, summary]) => summary.lines.length || summary.requests.length, lines = [];
   for (const [key, summary] of entries.filter(known)) {
     const line = element("li", "", "");
