@@ -135,7 +135,7 @@ bench soak stress: $(VENV)/.dev $(VENV)/.core
 
 # --- maintain
 
-.PHONY: format lock audit schema dist clean
+.PHONY: format lock audit dist clean
 format: $(VENV)/.dev ## format the source
 	$(BIN)/ruff check --fix-only
 	$(BIN)/ruff format
@@ -155,10 +155,6 @@ audit: ## compare all locked versions with published vulnerabilities; needs acce
 	@for lock in run view dev build dist; do echo "locks/$$lock.lock:"; \
 		build/audit/bin/pip-audit --vulnerability-service osv --disable-pip --require-hashes -r locks/$$lock.lock \
 		|| failed=1; done; exit $${failed:-0}
-
-schema: $(VENV)/.run ## write config/*.schema.json from the models of the deployment's and the node's file
-	$(BIN)/handtouch check --schema >config/handtouch.schema.json
-	$(BIN)/handtouch node --schema >config/touch_node.schema.json
 
 # for any Linux with glibc 2.17 or later on these machines; ziglang has a C compiler for both
 dist: $(VENV)/.dev ## build the source archive, wheels for x86_64 and aarch64, and a bill of materials (SBOM)
