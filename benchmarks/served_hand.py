@@ -3,9 +3,9 @@
 Nodes, daemon and subscribers are processes on a udp_multicast bus over loopback (in a network namespace of
 their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`.
 
-Public names: `in_own_network`, `on_loopback`, `open_bus`; `film`, `nodes`, `serving`, `bystanders`;
-`receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`; `ProcessorShare`, `processor_s`, `resident_mb`,
-`descriptors`; `asked_of`, `in_turns`.
+Public names: `in_own_network`, `on_loopback`, `open_bus`; `film`, `nodes`, `serving`, `daemon_process`,
+`bystanders`; `receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`; `ProcessorShare`, `processor_s`,
+`resident_mb`, `descriptors`; `asked_of`, `in_turns`.
 """
 
 from __future__ import annotations
@@ -208,11 +208,11 @@ def in_own_network() -> None:
     os.execvp("unshare", command)
 
 
-def on_loopback(folder: Path, port: int) -> Path:
-    """Write the shipped hand on a udp_multicast bus with endpoints in `folder`; return the path."""
+def on_loopback(folder: Path, port: int, file: str = "utah_mit.toml") -> Path:
+    """Write a shipped hand on a udp_multicast bus with endpoints in `folder`; return the path."""
     endpoints = "\n".join(f'{s} = "ipc://{folder}/{s}"' for s in ("live", "complete", "control", "inputs"))
     own = f'{endpoints}\nstore = "{folder}/calibrations.db"'
-    text = shipped.path("utah_mit.toml").read_text().replace("[daemon]\n", f"[daemon]\n{own}\n")
+    text = shipped.path(file).read_text().replace("[daemon]\n", f"[daemon]\n{own}\n")
     if VCAN.exists():
         text = text.replace('channel = "can0"', f'channel = "{VCAN.name}"')
     else:
@@ -250,20 +250,29 @@ def serving(config: Path, touched: int = TOUCHED) -> Iterator[tuple[int, Any]]:
     samples = film(deployment, PATHS["sliding"], range(touched))
     worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
     worker.start()
+    try:
+        with daemon_process(config) as pid:
+            with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+                socket.setsockopt(zmq.LINGER, 0)
+                socket.subscribe("hand/")
+                socket.connect(deployment.daemon.live)
+                wait_for_touch(socket, touched)
+            yield pid, stamps
+    finally:
+        stop.set()
+        worker.join()
+
+
+@contextmanager
+def daemon_process(config: Path) -> Iterator[int]:
+    """Run the daemon; yield its process."""
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
     daemon = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     try:
-        with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-            socket.setsockopt(zmq.LINGER, 0)
-            socket.subscribe("hand/")
-            socket.connect(deployment.daemon.live)
-            wait_for_touch(socket, touched)
-        yield daemon.pid, stamps
+        yield daemon.pid
     finally:
         daemon.terminate()
         daemon.wait()
-        stop.set()
-        worker.join()
 
 
 def in_turns(turns: int, cases: Iterable[str], measured: Callable[[str], dict[str, Any]]) -> Rows:

@@ -43,6 +43,26 @@ TOUCH = FEATURES["observation.touch"]["names"]
 COLUMNS = [TOUCH.index("thumb_tip.x_m"), TOUCH.index("thumb_tip.position_known")]
 
 
+class GripPolicy:
+    """Policies (count, 3) of as many grips, in one episode: the same in simulation and on a `Hand`."""
+
+    def __init__(self, weights: FloatArray) -> None:
+        self._weights = weights
+        self._begin_mm = np.full(len(weights), np.nan)
+        self._slid_mm = np.zeros(len(weights))
+
+    def act(self, touch: NDArray[np.float32], force_n: FloatArray) -> NDArray[np.float32]:
+        """Return actions (count, 1) for touch (count, size) and commanded forces (count,)."""
+        x_m, known = touch[:, COLUMNS].T.astype(np.float64)
+        self._begin_mm = np.where(np.isnan(self._begin_mm) & (known > 0), 1e3 * x_m, self._begin_mm)
+        slid_mm = np.where(known > 0, 1e3 * x_m - self._begin_mm, self._slid_mm)
+        speed_mm_s, self._slid_mm = (slid_mm - self._slid_mm) / PERIOD_S, slid_mm
+        features = np.stack([np.ones(len(slid_mm)), slid_mm, speed_mm_s])
+        target_n = np.einsum("nk,kn->n", self._weights, features)
+        actions: FloatArray = np.clip((target_n - force_n) / (MAX_RATE_N_S * PERIOD_S), -1, 1)
+        return actions.astype(np.float32)[:, None]
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What policies (count, 3) achieved in an episode each; arrays (count,)."""
@@ -61,19 +81,11 @@ def other_objects(count: int) -> tuple[FloatArray, FloatArray]:
 def run(grips: GripEnvironments, policies: FloatArray, objects: tuple[FloatArray, FloatArray]) -> Outcome:
     """Run an episode of each policy (count, 3) with its object."""
     observation, info = grips.reset(options={"objects": objects})
-    cost = np.zeros(grips.num_envs)
-    begin_mm = np.full(grips.num_envs, np.nan)
-    before_mm = np.zeros(grips.num_envs)
+    policy, cost = GripPolicy(policies), np.zeros(grips.num_envs)
     for _ in range(EPISODE_STEPS):
-        x_m, known = observation["observation.touch"][:, COLUMNS].T.astype(np.float64)
-        begin_mm = np.where(np.isnan(begin_mm) & (known > 0), 1e3 * x_m, begin_mm)
-        slid_mm = np.where(known > 0, 1e3 * x_m - begin_mm, before_mm)
-        speed_mm_s, before_mm = (slid_mm - before_mm) / PERIOD_S, slid_mm
-        features = np.stack([np.ones(grips.num_envs), slid_mm, speed_mm_s])
-        target_n = np.einsum("nk,kn->n", policies, features)
-        error_n = target_n - observation["observation.state"][:, 0]
-        action = np.clip(error_n / (MAX_RATE_N_S * PERIOD_S), -1, 1).astype(np.float32)
-        observation, reward, dropped, _, info = grips.step(action[:, None])
+        force_n = observation["observation.state"][:, 0].astype(np.float64)
+        action = policy.act(observation["observation.touch"], force_n)
+        observation, reward, dropped, _, info = grips.step(action)
         cost -= reward
     return Outcome(cost, info["grip_force_n"], dropped)
 

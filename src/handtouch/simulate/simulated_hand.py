@@ -22,7 +22,7 @@ from handtouch import config
 from handtouch.canbus.bus.port import open_bus
 from handtouch.config.channels import node_channels, parse_object
 from handtouch.config.tables import SIDE_ELECTRODES
-from handtouch.device import Device, DeviceBus
+from handtouch.device import Device, DeviceBus, Sampler
 from handtouch.device.inputs import MAX_CHANNELS
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.gripper import GripperStimulus
@@ -181,6 +181,42 @@ class SimulatedHand:
         self.stop()
 
 
+class NodesOnBus:
+    """The nodes of pads (hand's name, pad) on an open bus, as the deployment states them.
+
+    `bus` hosts them, `devices` are they by "hand/link"; rows of `sample` are the pads in their order, columns
+    the electrodes in that of their names.
+    """
+
+    def __init__(
+        self,
+        deployment: config.Deployment,
+        pads: Sequence[tuple[str, config.Pad]],
+        port: can.BusABC,
+        sample: Sampler,
+    ) -> None:
+        self.bus = DeviceBus(port, sample)
+        self.devices: dict[str, Device] = {}
+        for hand, pad in pads:
+            node = deployment.nodes[pad.node]
+            channels = node_channels(node)
+            device = self.bus.add(
+                pad.node_id,
+                eds=node.eds,
+                vendor_id=node.vendor_id,
+                product_code=node.product_code,
+                serial=pad.serial,
+                channels=tuple((c.index, c.sub) for c in channels),
+                counts_per_unit=tuple(c.counts_per_unit for c in channels),
+                excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
+            )
+            wired = tuple(map(pad.electrode_names.index, pad.electrodes))
+            if pad.shear:
+                wired += tuple(len(wired) + SIDE_ELECTRODES.index(name) for name in pad.shear_electrodes)
+            device.wiring = (*wired, *range(len(wired), MAX_CHANNELS))
+            self.devices[f"{hand}/{pad.link}"] = device
+
+
 class _SimulatedBus:
     """One bus with its nodes."""
 
@@ -196,27 +232,9 @@ class _SimulatedBus:
     ) -> None:
         self.name = name
         self.sync_times_ns: deque[int] = deque()
-        self.devices: dict[str, Device] = {}
         self._virtual_hand, self._clock, self._record = virtual_hand, clock, record
-        self.nodes = DeviceBus(port, self._sample_at)
-        for hand, pad in virtual_hand.pads:
-            node = deployment.nodes[pad.node]
-            channels = node_channels(node)
-            device = self.nodes.add(
-                pad.node_id,
-                eds=node.eds,
-                vendor_id=node.vendor_id,
-                product_code=node.product_code,
-                serial=pad.serial,
-                channels=tuple((c.index, c.sub) for c in channels),
-                counts_per_unit=tuple(c.counts_per_unit for c in channels),
-                excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
-            )
-            wired = tuple(map(pad.electrode_names.index, pad.electrodes))
-            if pad.shear:
-                wired += tuple(len(wired) + SIDE_ELECTRODES.index(name) for name in pad.shear_electrodes)
-            device.wiring = (*wired, *range(len(wired), MAX_CHANNELS))
-            self.devices[f"{hand}/{pad.link}"] = device
+        nodes = NodesOnBus(deployment, virtual_hand.pads, port, self._sample_at)
+        self.nodes, self.devices = nodes.bus, nodes.devices
         self._touch_counter = TouchCounter()
         self._excited = [True] * len(virtual_hand.pads)
         self._events = sorted(self._node_events(stimulus), key=lambda event: event[0])

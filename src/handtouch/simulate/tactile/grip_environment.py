@@ -1,6 +1,7 @@
 """A Gymnasium task on MuJoCo and `TactileSensor`: hold an object of unknown weight and friction gently.
 
-Public names: `GripEnvironments` (many at once), `GripEnvironment` (one), `FEATURES`, `objects_at`.
+Public names: `GripEnvironments` (many at once), `GripEnvironment` (one), `GripScene` (its physics, without
+touch), `TOUCH` and `FEATURES` (observations), `objects_at`.
 Needs the extra `gym`.
 """
 
@@ -71,75 +72,85 @@ FEATURES: Mapping[str, Mapping[str, Any]] = {
 """Observations and action as LeRobot declares the features of a dataset; its `fps` is 1 / PERIOD_S."""
 
 
-class _Grips:
-    """Simulations of `count` grips; arrays have the first axis (count,)."""
+class GripScene:
+    """One grip in MuJoCo, `model` and `data`; begin an episode with `reset`.
 
-    def __init__(self, count: int, world: str, seed: int) -> None:
-        model = mujoco.MjModel.from_xml_string(_SCENE)
-        self.models = [copy.copy(model) for _ in range(count)]
-        self.states = [mujoco.MjData(own) for own in self.models]
-        self.sensor = TactileSensor(
-            config.load(shipped.path("two_finger.toml")), model, world, seed, environments=count
-        )
-        self.force_n, self.steps = np.full(count, INITIAL_FORCE_N), np.zeros(count, np.int64)
-        self.dropped = np.zeros(count, np.bool_)
-        self._mass_kg = np.zeros(count)
-        self._body = model.body("object").id
-        self._inertia_m2 = model.body_inertia[self._body] / model.body_mass[self._body]
-        self._geoms = [model.geom(name).id for name in ("bead", "back")]
-        self.touch = np.zeros((count, TOUCH.size), np.float32)
+    `force_n`: commanded; `dropped`: whether the object has slid too far in this episode; `steps`: of it.
+    """
 
-    def reset(self, number: int, mass_kg: float, friction: float) -> None:
-        """Put a new object into a grip, supported."""
-        model, data = self.models[number], self.states[number]
+    def __init__(self, model: Any | None = None) -> None:
+        self.model = mujoco.MjModel.from_xml_string(_SCENE) if model is None else copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        self.force_n, self.steps, self.dropped = INITIAL_FORCE_N, 0, False
+        self._substeps = round(PERIOD_S / self.model.opt.timestep)
+        self._body = self.model.body("object").id
+        self._inertia_m2 = self.model.body_inertia[self._body] / self.model.body_mass[self._body]
+        self._geoms = [self.model.geom(name).id for name in ("bead", "back")]
+
+    def reset(self, mass_kg: float, friction: float) -> None:
+        """Put a new object into the grip, supported."""
+        model = self.model
         model.body_inertia[self._body] = mass_kg * self._inertia_m2
         model.body_mass[self._body] = mass_kg
         model.geom_friction[self._geoms, 0] = friction
-        mujoco.mj_setConst(model, data)
-        mujoco.mj_resetData(model, data)
-        self._mass_kg[number], self.force_n[number] = mass_kg, INITIAL_FORCE_N
-        self.steps[number], self.dropped[number] = 0, False
+        mujoco.mj_setConst(model, self.data)
+        mujoco.mj_resetData(model, self.data)
+        self.force_n, self.steps, self.dropped = INITIAL_FORCE_N, 0, False
+
+    def step(self, action: float) -> float:
+        """Apply an action for `PERIOD_S`; return the reward, 0 after the object was dropped."""
+        if self.dropped:
+            return 0.0
+        change_n = PERIOD_S * MAX_RATE_N_S * min(max(action, -1.0), 1.0)
+        self.force_n = min(max(self.force_n + change_n, MIN_FORCE_N), MAX_FORCE_N)
+        before_m, self.steps = self.slip_m, self.steps + 1
+        self.data.ctrl[0] = self.force_n
+        begin_s, end_s = _LIFT_S
+        supported = min(max((end_s - self.data.time) / (end_s - begin_s), 0.0), 1.0)
+        weight_n = 9.81 * self.model.body_mass[self._body]
+        self.data.xfrc_applied[self._body, 2] = supported * weight_n
+        mujoco.mj_step(self.model, self.data, self._substeps)
+        self.dropped = self.slip_m > MAX_SLIP_M
+        cost = PERIOD_S * self.force_n + 100.0 * max(self.slip_m - before_m, 0.0)
+        left_s = PERIOD_S * (EPISODE_STEPS - self.steps)
+        return float(-cost - self.dropped * (DROP_COST + left_s * MAX_FORCE_N))
+
+    @property
+    def slip_m(self) -> float:
+        """How far the object has slid down."""
+        return float(-self.data.qpos[1])
+
+    @property
+    def state(self) -> tuple[float, float]:
+        """Commanded force and position of the finger."""
+        return self.force_n, float(self.data.qpos[2])
+
+
+class _Grips:
+    """Simulations of `count` grips and their touch (count, size)."""
+
+    def __init__(self, count: int, world: str, seed: int) -> None:
+        first = GripScene()
+        self.scenes = [first, *(GripScene(first.model) for _ in range(count - 1))]
+        deployment = config.load(shipped.path("two_finger.toml"))
+        self.sensor = TactileSensor(deployment, first.model, world, seed, environments=count)
+        self.touch = np.zeros((count, TOUCH.size), np.float32)
 
     def read(self) -> None:
         """Sense all grips."""
-        self.touch = TOUCH.of(self.sensor.read(self.states), links=self.sensor.links)
+        states = [scene.data for scene in self.scenes]
+        self.touch = TOUCH.of(self.sensor.read(states), links=self.sensor.links)
 
     def step(self, actions: FloatArray) -> FloatArray:
         """Apply actions (count,) for a period; return the rewards (count,)."""
-        active = ~self.dropped
-        rate_n_s = MAX_RATE_N_S * np.clip(actions, -1.0, 1.0)
-        self.force_n = np.where(
-            active, np.clip(self.force_n + PERIOD_S * rate_n_s, MIN_FORCE_N, MAX_FORCE_N), self.force_n
-        )
-        before_m = self.slip_m
-        for number in np.flatnonzero(active).tolist():
-            self._advance(number)
-        self.steps += active
+        pairs = zip(self.scenes, actions.tolist(), strict=True)
+        rewards = np.array([scene.step(action) for scene, action in pairs])
         self.read()
-        slid_m = self.slip_m
-        self.dropped |= slid_m > MAX_SLIP_M
-        cost = PERIOD_S * self.force_n + 100.0 * np.maximum(slid_m - before_m, 0.0)
-        left_s = PERIOD_S * (EPISODE_STEPS - self.steps)
-        return np.where(active, -cost - self.dropped * (DROP_COST + left_s * MAX_FORCE_N), 0.0)
+        return rewards
 
-    @property
-    def slip_m(self) -> FloatArray:
-        """How far the objects have slid down."""
-        return np.array([-data.qpos[1] for data in self.states])
-
-    @property
-    def state(self) -> NDArray[np.float32]:
-        """Commanded force and position of the finger (count, 2)."""
-        finger_m = [data.qpos[2] for data in self.states]
-        return np.stack([self.force_n, finger_m], axis=1).astype(np.float32)
-
-    def _advance(self, number: int) -> None:
-        data = self.states[number]
-        data.ctrl[0] = self.force_n[number]
-        begin_s, end_s = _LIFT_S
-        supported = float(np.clip((end_s - data.time) / (end_s - begin_s), 0.0, 1.0))
-        data.xfrc_applied[self._body, 2] = supported * 9.81 * self._mass_kg[number]
-        mujoco.mj_step(self.models[number], data, self.sensor.steps)
+    def column(self, name: str) -> NDArray[Any]:
+        """Return an attribute of all grips (count, ...)."""
+        return np.array([getattr(scene, name) for scene in self.scenes])
 
 
 def _observation_space() -> gymnasium.Space[Any]:
@@ -182,7 +193,7 @@ class GripEnvironments(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]
         drawn = self.np_random.random((self.num_envs, 2))
         mass_kg, friction = options.get("objects", objects_at(drawn))
         for number in chosen.tolist():
-            self._grips.reset(number, float(mass_kg[number]), float(friction[number]))
+            self._grips.scenes[number].reset(float(mass_kg[number]), float(friction[number]))
         self._grips.sensor.reset(chosen.tolist())
         self._grips.read()
         return self._observation(), {}
@@ -192,12 +203,13 @@ class GripEnvironments(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]
     ) -> tuple[Observation, NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Apply actions (count, 1) for `PERIOD_S`; dropped objects stay dropped."""
         reward = self._grips.step(np.asarray(actions, np.float64)[:, 0])
-        truncated = self._grips.steps >= EPISODE_STEPS
-        info = {"slip_m": self._grips.slip_m, "grip_force_n": self._grips.force_n.copy()}
-        return self._observation(), reward, self._grips.dropped.copy(), truncated, info
+        truncated = self._grips.column("steps") >= EPISODE_STEPS
+        info = {"slip_m": self._grips.column("slip_m"), "grip_force_n": self._grips.column("force_n")}
+        return self._observation(), reward, self._grips.column("dropped"), truncated, info
 
     def _observation(self) -> Observation:
-        return {"observation.state": self._grips.state, "observation.touch": self._grips.touch}
+        state = self._grips.column("state").astype(np.float32)
+        return {"observation.state": state, "observation.touch": self._grips.touch}
 
 
 class GripEnvironment(gymnasium.Env[Observation, NDArray[np.float32]]):

@@ -1,6 +1,6 @@
 """Touch of a hand in a MuJoCo simulation: the arrays that the daemon would publish, without a bus or daemon.
 
-Public name: `TactileSensor`.
+Public names: `TactileSensor`, `world_named`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class TactileSensor:
         self._period_ns = round(1e9 * self.period_s)
         pads = [entry.pad for entry in deployment.pads]
         self._reader = ContactReader(pads, model, bodies or {})
-        drawn = [_world_named(world).draw(number) for number in seeds[:environments]]
+        drawn = [world_named(world).draw(number) for number in seeds[:environments]]
         self._members = [np.arange(first, environments, len(drawn)) for first in range(len(drawn))]
         self._hands = [
             SimulatedPads(deployment, one, len(members), self.period_s)
@@ -267,7 +267,8 @@ def _channel_limits(deployment: config.Deployment) -> NDArray[np.int64]:
     )
 
 
-def _world_named(world: str | World) -> World:
+def world_named(world: str | World) -> World:
+    """Return a world by its name. Raises ValueError for an unknown one."""
     if isinstance(world, World):
         return world
     if world not in WORLDS:
