@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zmq
 
-from handtouch import wire
+from handtouch import cli, wire
 from handtouch.cli import record
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.publisher import Publisher
@@ -65,9 +65,8 @@ def daemon(make_hand: Callable[..., Hand], tmp_path: Path) -> Iterator[Daemon]:
 
 
 def _record(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "handtouch", "record", *arguments], stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-m", "handtouch", "record", *arguments]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def _end(process: subprocess.Popen[str]) -> tuple[int, str]:
@@ -97,6 +96,32 @@ def test_a_daemon_is_recorded_until_ctrl_c_and_every_file_is_listed(daemon: Daem
         assert not recording.truncation
         ticks += [entry.payload["tick"] for entry in recording.read("tick")]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+
+
+def test_lines_on_standard_input_are_marks_and_every_reader_of_the_recording_takes_them(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    out = tmp_path / "marked.mcap"
+    process = _record("-o", str(out), "--endpoint", daemon.endpoint, "--marks")
+    assert process.stdin is not None
+    end_s = time.monotonic() + LONGEST_S
+    while not out.exists() or out.stat().st_size < 3000:
+        assert time.monotonic() < end_s, process.poll()
+        daemon.tick()
+        time.sleep(0.002)
+    process.stdin.write("pick up\n\n")
+    process.stdin.flush()
+    for _ in range(200):  # the thread that reads lines has its time
+        daemon.tick()
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    status, err = _end(process)
+    assert status == 0, err
+    marks = list(Recording(out).read("mark"))
+    assert [mark.payload["text"] for mark in marks] == ["pick up", ""]
+    assert marks[0].wall_ns <= marks[1].wall_ns
+    for command in (["replay", str(out)], ["export", str(out), "-o", str(tmp_path / "tables")]):
+        assert cli.main(command) == 0
 
 
 def test_too_little_free_space_ends_recording_with_status_1(daemon: Daemon, tmp_path: Path) -> None:

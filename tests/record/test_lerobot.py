@@ -14,7 +14,7 @@ from handtouch.client.hand_arrays import HandArrays
 from handtouch.learn import TouchFeatures
 from handtouch.record.lerobot import STATE, TOUCH, WINDOW, export_lerobot
 from handtouch.record.recording import Recording
-from tests.record.conftest import PERIOD_NS, RecordingSession
+from tests.record.conftest import PERIOD_NS, WALL_NS, RecordingSession
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra export")
 JOINTS = ("base_joint", "tip_joint")
@@ -156,3 +156,28 @@ def test_what_can_t_be_exported_says_so(
     (tmp_path / "full/file").touch()
     with pytest.raises(OSError, match="isn't empty"):
         export_lerobot(recording, tmp_path / "full")
+
+
+def test_marks_begin_episodes_name_their_tasks_and_leave_out(recorded: Recorded, tmp_path: Path) -> None:
+    def mark(text: str) -> None:
+        recorded.session.recorder.add_mark(text, recorded.hand.t_ns + WALL_NS)
+
+    recorded.stroke(60)
+    for text in ("pick", "-", "place", "pick", ""):
+        mark(text)
+        recorded.stroke(60)
+    counts = export_lerobot(recorded.finish(), tmp_path / "set", fps=30.0, task="other")
+    assert counts.episodes == 5  # what follows "-" is left out
+    episodes = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet")
+    assert episodes["tasks"].to_pylist() == [["other"], ["pick"], ["place"], ["pick"], ["other"]]
+    names = parquet.read_table(tmp_path / "set/meta/tasks.parquet").to_pydict()
+    numbers = dict(zip(names["__index_level_0__"], names["task_index"], strict=True))
+    assert [set(rows(tmp_path / "set", k)["task_index"]) for k in range(5)] == [
+        {numbers[name]} for name in ("other", "pick", "place", "pick", "other")
+    ]
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["total_tasks"] == 3
+    features = TouchFeatures(recorded.frames[0].links)
+    each = [features.of(HandArrays(frame)) for frame in recorded.frames]
+    for number, part in enumerate((0, 1, 3, 4, 5)):
+        window = rows(tmp_path / "set", number)[WINDOW].astype(np.float32)
+        assert window[0, -1].tobytes() == each[60 * part].tobytes()  # the first sample after the mark

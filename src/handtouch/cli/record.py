@@ -6,6 +6,7 @@ Public name: `run`.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from handtouch.host.installation import extra_command
 from handtouch.host.json_output import print_json
 from handtouch.host.signals import stop_on_signals
 from handtouch.record.capture import BYTES_PER_MB, Capture, RecordOptions
+from handtouch.record.schemas import MARK
 
 NO_MESSAGE_TEXT = "no message received; is `handtouch run` running?"
 _MAX_SHOWN_MINUTES = 600
@@ -55,6 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also record hand frames, all pads in one message per tick (not needed: replay recomputes them)",
     )
     add_percepts(parser)
+    parser.add_argument(
+        "--marks",
+        action="store_true",
+        help="each line on standard input marks a moment, at which an exported dataset begins an episode: "
+        "its text is the task, - leaves out what follows",
+    )
     add_number(parser, "--rotate-mb", "MB", "start a new file after this size (default: never)", default=0.0)
     add_number(
         parser, "--rotate-minutes", "MIN", "start a new file after this time (default: never)", default=0.0
@@ -64,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(*, as_json: bool, **options: Any) -> int:
+def run(*, as_json: bool, marks: bool = False, **options: Any) -> int:
     """Record until Ctrl-C, or for the given time; other `options` as of `record.capture.RecordOptions`.
 
     Exit status 0; 1 if no message was received, messages were lost, the disk is full or the daemon rejects
@@ -72,7 +80,8 @@ def run(*, as_json: bool, **options: Any) -> int:
     """
     with failing(2, ValueError, OSError):
         endpoint = find_endpoint("complete", options.pop("endpoint", None), options.get("config"))
-        capture = Capture.open(RecordOptions(endpoint=endpoint, **options))
+        lines = sys.stdin if marks else None
+        capture = Capture.open(RecordOptions(endpoint=endpoint, marks=lines, **options))
     stop = stop_on_signals()
     with ProgressLine() as line:
         line.print_line(f"recording {capture.endpoint} into {capture.files.folder or '.'}; stop with Ctrl-C")
@@ -110,9 +119,10 @@ def _progress_text(capture: Capture, seconds: float) -> str:
         minutes = capture.files.free_bytes() / rate / 60
         left = f", disk full in {minutes:.0f} min" if minutes < _MAX_SHOWN_MINUTES else ""
     lost = sum(recorder.lost.values())
+    marks = f", {recorder.messages[MARK]} marks" if recorder.messages[MARK] else ""
     return (
         f"{seconds:.0f} s, {recorder.size / BYTES_PER_MB:.1f} MB ({60 * rate / BYTES_PER_MB:.1f} MB/min), "
-        f"{recorder.messages['tick']} ticks, {recorder.contacts} contacts, {lost} lost{left}"
+        f"{recorder.messages['tick']} ticks, {recorder.contacts} contacts, {lost} lost{marks}{left}"
     )
 
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 import itertools
 import os
 import platform
+import queue
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from handtouch import __version__, wire
 from handtouch.client import SERVICE_TIMEOUT_S, Subscriber
@@ -49,6 +50,8 @@ class RecordOptions:
     rotate_mb: float = 0.0
     rotate_minutes: float = 0.0
     keep_free_mb: float = 200.0
+    marks: TextIO | None = None
+    """each line is a mark; None: no marks"""
 
 
 class RecordingFiles:
@@ -160,10 +163,13 @@ class Capture:
         options, source, recorder = self._options, self._source, self.recorder
         end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
         next_poll_s, received_s = 0.0, time.monotonic()
+        marks = _read_marks(options.marks) if options.marks else None
         while not stop.is_set() and (now_s := time.monotonic()) < end_s:
             if (parts := source.recv_unchecked(0.1)) is not None:
                 received_s = now_s
                 recorder.add_message(parts, time.monotonic_ns())
+            while marks and not marks.empty():
+                recorder.add_mark(*marks.get())
             if now_s < next_poll_s:
                 continue
             next_poll_s = now_s + _POLL_PERIOD_S
@@ -177,6 +183,18 @@ class Capture:
                     f"less than {options.keep_free_mb:g} MB are free in {self.files.folder}: recording ended"
                 )
         return ""
+
+
+def _read_marks(lines: TextIO) -> queue.SimpleQueue[tuple[str, int]]:
+    """Return a queue of lines and the times of reading them, since 1970 UTC, which a thread fills."""
+    marks: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in lines:
+            marks.put((line.strip(), time.time_ns()))
+
+    threading.Thread(target=read, name="marks", daemon=True).start()
+    return marks
 
 
 def _scene_converter() -> Callable[[], SceneConverter]:

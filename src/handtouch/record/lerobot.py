@@ -2,7 +2,7 @@
 
 Public names: `export_lerobot`, `LerobotCounts`. Needs pyarrow.
 
-Episodes are what a gap or another session of the daemon separates. A frame has the newest touch
+Episodes are what a mark, a gap or another session of the daemon separates. A frame has the newest touch
 (`observation.touch`), all samples since the frame before (`observation.touch_window`, oldest first, rows of 0
 where there were fewer), and where they were recorded the joint positions (`observation.state`).
 """
@@ -23,11 +23,14 @@ from handtouch.client.window import HandWindow
 from handtouch.learn import TouchFeatures
 from handtouch.learn.features import Frame
 from handtouch.record.recording import Recording
+from handtouch.record.schemas import MARK
 
 TOUCH, WINDOW, STATE = "observation.touch", "observation.touch_window", "observation.state"
 _VERSION, _CHUNK_FILES = "v3.0", 1000
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
+_LEFT_OUT = "-"
+"""Text of a mark after which frames belong to no episode"""
 _MAX_SAMPLES = 1000
 """Samples between two frames: 1 kHz at one frame a second"""
 FloatArray = NDArray[np.float32]
@@ -48,6 +51,8 @@ class LerobotCounts(NamedTuple):
 class _Episode:
     """Hand frames without a gap, and joint positions in between."""
 
+    task: str
+    """text of the mark that it begins with"""
     frames: list[wire.HandFrame] = field(default_factory=list)
     joints_ns: list[int] = field(default_factory=list)
     positions: list[list[float]] = field(default_factory=list)
@@ -73,7 +78,8 @@ def export_lerobot(
 ) -> LerobotCounts:
     """Write the frames of a hand into a folder, as a LeRobot dataset; the recording is read twice.
 
-    `hand`: by default the only one. `max_gap_s`: longest time between two frames of an episode.
+    `hand`: by default the only one. `max_gap_s`: longest time between two frames of an episode. `task`: of
+    episodes that begin with no mark, or with one without text.
     Raises ValueError for a recording without frames of the hand, several hands, or a rate that is too low,
     OSError if the folder isn't empty, ImportError without pyarrow.
     """
@@ -83,13 +89,15 @@ def export_lerobot(
     features: TouchFeatures | None = None
     writer: _DatasetWriter | None = None
     for number, episode in enumerate(_episodes(recording, hand, joints, max_gap_s)):
+        if episode.task == _LEFT_OUT:
+            continue
         if features is None or writer is None:
             features = TouchFeatures(episode.frames[0].links, frame=frame)
-            writer = _DatasetWriter(folder, features, samples, joints, fps, task)
+            writer = _DatasetWriter(folder, features, samples, joints, fps)
         on_progress(f"{number} episodes written to {folder}")
         columns = _columns_of(episode, features, samples, fps, bool(joints))
         if len(columns[TOUCH]):
-            writer.add(columns)
+            writer.add(columns, episode.task or task)
     if writer is None or not writer.lengths:
         raise ValueError(
             f"{recording.path}: no frame of hand {hand} was recorded for a whole period of {fps:g} Hz"
@@ -133,9 +141,14 @@ def _survey(recording: Recording, hand: str, fps: float) -> tuple[int, str, tupl
 
 def _episodes(recording: Recording, hand: str, joints: Sequence[str], max_gap_s: float) -> Iterator[_Episode]:
     """Yield the episodes of a hand."""
-    episode = _Episode()
-    for entry in recording.read("hand", "joints"):
+    episode = _Episode("")
+    for entry in recording.read("hand", "joints", MARK):
         payload = entry.payload
+        if entry.topic == MARK:
+            if episode.frames:
+                yield episode
+            episode = _Episode(str(payload["text"]), [], episode.joints_ns[-1:], episode.positions[-1:])
+            continue
         if payload.get("hand") != hand:
             continue
         if entry.topic.startswith("joints/"):
@@ -150,7 +163,7 @@ def _episodes(recording: Recording, hand: str, joints: Sequence[str], max_gap_s:
         if changed or frame.t_ns - last.t_ns > 1e9 * max_gap_s:
             yield episode
             kept = slice(0, 0) if changed else slice(-1, None)  # joints stand still in a gap
-            episode = _Episode([], episode.joints_ns[kept], episode.positions[kept])
+            episode = _Episode(episode.task, [], episode.joints_ns[kept], episode.positions[kept])
         if not episode.frames or frame.seq > last.seq:
             episode.frames.append(frame)
     if episode.frames:
@@ -191,10 +204,11 @@ class _DatasetWriter:
         samples: int,
         joints: tuple[str, ...],
         fps: float,
-        task: str,
     ) -> None:
         self.lengths: list[int] = []
-        self._folder, self._fps, self._task = folder, fps, task
+        self._folder, self._fps = folder, fps
+        self._tasks: list[str] = []
+        self._task_of: list[int] = []
         one: dict[str, Any] = {"shape": (1,), "names": None}
         self._features: dict[str, dict[str, Any]] = {
             TOUCH: features.declaration(),
@@ -209,14 +223,17 @@ class _DatasetWriter:
         }
         self._stats: list[dict[str, dict[str, NDArray[Any]]]] = []
 
-    def add(self, columns: dict[str, NDArray[Any]]) -> None:
-        """Add an episode."""
+    def add(self, columns: dict[str, NDArray[Any]], task: str) -> None:
+        """Add an episode with its task in words."""
+        if task not in self._tasks:
+            self._tasks.append(task)
+        self._task_of.append(self._tasks.index(task))
         number, length = len(self.lengths), len(columns["timestamp"])
         first = sum(self.lengths)
         columns["frame_index"] = np.arange(length)
         columns["episode_index"] = np.full(length, number)
         columns["index"] = np.arange(first, first + length)
-        columns["task_index"] = np.zeros(length, np.int64)
+        columns["task_index"] = np.full(length, self._task_of[-1])
         self._write(f"data/{_file_name(number)}", {name: columns[name] for name in self._features})
         self._stats.append({name: _statistics(columns[name]) for name in self._features})
         self.lengths.append(length)
@@ -226,7 +243,7 @@ class _DatasetWriter:
         ends = np.cumsum(self.lengths)
         episodes: dict[str, Any] = {
             "episode_index": np.arange(len(ends)),
-            "tasks": [[self._task]] * len(ends),
+            "tasks": [[self._tasks[number]] for number in self._task_of],
             "length": np.array(self.lengths),
             "data/chunk_index": np.arange(len(ends)) // _CHUNK_FILES,
             "data/file_index": np.arange(len(ends)) % _CHUNK_FILES,
@@ -248,7 +265,7 @@ class _DatasetWriter:
                 "robot_type": "handtouch",
                 "total_episodes": len(self.lengths),
                 "total_frames": sum(self.lengths),
-                "total_tasks": 1,
+                "total_tasks": len(self._tasks),
                 "chunks_size": _CHUNK_FILES,
                 "data_files_size_in_mb": 100,
                 "video_files_size_in_mb": 200,
@@ -297,7 +314,8 @@ class _DatasetWriter:
             "columns": columns,
             "pandas_version": "2.0.0",
         }
-        table = pyarrow.table({"task_index": pyarrow.array([0], pyarrow.int64()), index: [self._task]})
+        numbers = pyarrow.array(range(len(self._tasks)), pyarrow.int64())
+        table = pyarrow.table({"task_index": numbers, index: self._tasks})
         self._write_table("meta/tasks.parquet", table.replace_schema_metadata({"pandas": json.dumps(pandas)}))
 
     def _write(self, name: str, columns: Mapping[str, Any]) -> None:

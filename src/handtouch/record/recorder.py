@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from handtouch import wire
-from handtouch.record.schemas import ENCODING, MessageFormat, SceneMessage
+from handtouch.record.schemas import ENCODING, MARK, MARK_FORMAT, MessageFormat, SceneMessage
 from handtouch.wire.codec import check_fields, unpack
 
 _FLUSH_PERIOD_NS = 1_000_000_000
@@ -122,6 +122,14 @@ class MessageRecorder:
         for held in waiting:
             self._store_message(*held, now_ns)
         self._store_message(topic, parts[1], payload, now_ns)
+
+    def add_mark(self, text: str, wall_ns: int) -> None:
+        """Record a mark at a time since 1970 UTC; before the first message of a daemon there is none."""
+        if self.file is None or self._wall_offset_ns is None:
+            return
+        mark = {"t_ns": wall_ns - self._wall_offset_ns, "text": text}
+        self.messages[MARK] += 1
+        self._write(MARK, json.dumps(mark).encode(), wall_ns, form=MARK_FORMAT)
 
     def poll(self, now_ns: int) -> None:
         """Flush, and request the state if it is due; call this about once a second."""

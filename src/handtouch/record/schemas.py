@@ -1,6 +1,6 @@
 """Formats of recorded channels, and JSON schemas of the wire's payloads.
 
-Public names: `MessageFormat`, `SceneMessage`, `wire_format`, `ENCODING`.
+Public names: `MessageFormat`, `SceneMessage`, `wire_format`, `ENCODING`, `MARK`, `MARK_FORMAT`.
 
 Payloads with binary columns are stored as received, in msgpack; the others as JSON, which Foxglove plots and
 lists without conversion. Both have JSON schemas; in those of msgpack, a "string" with `contentEncoding`
@@ -48,6 +48,17 @@ class SceneMessage(NamedTuple):
     topic: str
     format: MessageFormat
     data: bytes
+
+
+MARK = "mark"
+"""Topic of a mark, which `handtouch record --marks` takes from standard input"""
+_MARK_KEYS = {"t_ns": {"type": "integer"}, "text": {"type": "string"}}
+MARK_FORMAT = MessageFormat(
+    "json",
+    "handtouch.Mark",
+    "jsonschema",
+    json.dumps({"type": "object", "properties": _MARK_KEYS, "required": [*_MARK_KEYS]}).encode(),
+)
 
 
 @cache
