@@ -174,10 +174,13 @@ class SheetMapBank:
 
     def __init__(self, sheets: Sequence[SheetMaps]) -> None:
         rows = max(len(sheet.table) for sheet in sheets)
-        self._rows = np.arange(rows)
-        self._tables = np.zeros((len(sheets), rows, *sheets[0].table.shape[1:]))
-        for table, sheet in zip(self._tables, sheets, strict=True):
-            table[: len(sheet.table) - 1], table[-1] = sheet.table[:-1], sheet.table[-1]
+        self._shape = sheets[0].table.shape[1:]
+        tables = np.zeros((len(sheets), *self._shape, rows))
+        for table, sheet in zip(tables, sheets, strict=True):
+            table[..., : len(sheet.table) - 1] = np.moveaxis(sheet.table[:-1], 0, -1)
+            table[..., -1] = sheet.table[-1]
+        self._table = tables.reshape(-1, rows)
+        """(sheets * nodes along s * nodes along phi, rows)"""
 
     def look_up(
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
@@ -191,17 +194,15 @@ class SheetMapBank:
         """
         row, of_s, slope_s = _basis(_SHARE_BREAKS, s)
         column, of_phi, slope_phi = _basis(_SHARE_BREAKS, phi)
-        patch = self._tables[
-            sheet[:, None, None, None],
-            self._rows[:, None, None],
-            row[:, None, :, None],
-            column[:, None, None, :],
-        ]
-        across = patch @ np.stack([of_phi, slope_phi], axis=-1)[:, None]  # (k, 5, degree + 1, 2)
-        values = np.einsum("kmi,ki->mk", across[..., 0], of_s)
-        by_s = np.einsum("kmi,ki->mk", across[..., 0], slope_s)
-        by_phi = np.einsum("kmi,ki->mk", across[..., 1], of_s)
-        return values, np.stack([by_s, by_phi], axis=1)
+        first = sheet * (self._shape[0] * self._shape[1])
+        node = (first[:, None] + row * self._shape[1])[:, :, None] + column[:, None, :]
+        patch = self._table.take(node.reshape(len(sheet), -1), axis=0)  # (k, (degree + 1)^2, w + 1)
+        weights = np.empty((len(sheet), 3, *node.shape[1:]))
+        np.multiply(of_s[:, :, None], of_phi[:, None, :], out=weights[:, 0])
+        np.multiply(slope_s[:, :, None], of_phi[:, None, :], out=weights[:, 1])
+        np.multiply(of_s[:, :, None], slope_phi[:, None, :], out=weights[:, 2])
+        found = (weights.reshape(len(sheet), 3, -1) @ patch).transpose(2, 1, 0)
+        return found[:, 0].copy(), found[:, 1:].copy()
 
     def look_up_anywhere(
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
@@ -398,7 +399,9 @@ def _basis(breaks: FloatArray, at: FloatArray) -> tuple[NDArray[np.intp], FloatA
     inside = np.clip(at, EDGE_INSET_FRACTION, 1 - EDGE_INSET_FRACTION)
     element = np.clip(np.searchsorted(breaks, inside, side="right") - 1, 0, len(breaks) - 2)
     half = (breaks[element + 1] - breaks[element]) / 2
-    powers = ((inside - breaks[element]) / half - 1)[:, None] ** _POWERS
+    powers = np.ones((len(_POWERS), len(inside)))
+    powers[1:] = (inside - breaks[element]) / half - 1
+    powers = np.multiply.accumulate(powers, axis=0).T
     return _TABLE_DEGREE * element[:, None] + _POWERS, powers @ _VALUES, (powers @ _SLOPES) / half[:, None]
 
 

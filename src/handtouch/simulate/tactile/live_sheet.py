@@ -41,6 +41,8 @@ class LiveSheets:
 
         `warmer_k`: temperature above that at the start.
         """
+        if not (len(sheets) or self._loaded):
+            return np.zeros(0)
         now = set(sheets.tolist())
         for sheet in self._loaded - now:
             self._advance(t_s, sheet, 0.0, warmer_k)
