@@ -230,6 +230,18 @@ def test_the_configured_joint_std_applies_to_joint_states_without_one() -> None:
     assert trace[1] < 0.5 * trace[0]
 
 
+@pytest.mark.parametrize("stated", [None, 0.01])
+def test_backlash_is_part_of_all_joints_errors(stated: float | None) -> None:
+    own, play = 0.01, 0.05
+    robots = stating(joint_std_deg=np.degrees(own), joint_backlash_deg=np.degrees(play))
+    found = TouchedHand(TIP, HEEL, joints=joint_states(100, std=stated), robots=robots).step()
+    whole = TouchedHand(TIP, HEEL, joints=joint_states(100, std=np.hypot(own, play / np.sqrt(12)))).step()
+    for pad in (TIP, HEEL):
+        for frame in ("palm", "base"):
+            name = f"{frame}_covariance_m2"
+            assert found.contact_fields(pad)[name] == pytest.approx(whole.contact_fields(pad)[name])
+
+
 def test_stale_joints_give_a_status_and_their_age_and_fixed_links_stay_valid() -> None:
     frames = TouchedHand(TIP, HEEL, joints=joint_states(100 - 150)).step()
     tip, heel = frames.contact_fields(TIP), frames.contact_fields(HEEL)

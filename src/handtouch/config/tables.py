@@ -599,6 +599,14 @@ class HandTable(Table):
     joint_std_mm: NonNegative = Field(
         0.0, description="error of prismatic joints (1 sigma), used like joint_std_deg"
     )
+    joint_backlash_deg: NonNegative = Field(
+        0.0,
+        description="play between a joint's encoder and its link, from one end to the other; included in "
+        "these covariances as even over the play, also where joint states carry position_std_rad",
+    )
+    joint_backlash_mm: NonNegative = Field(
+        0.0, description="play of prismatic joints, used like joint_backlash_deg"
+    )
     joint_state_timeout_ms: Positive = Field(
         100.0,
         description="positions in palm and base are stale when the nearest joint state is farther in time",

@@ -51,7 +51,7 @@ class ContactTransforms:
         self._robots = robots
         self._poses = [LinkPoses(kinematics) for kinematics in robots.kinematics] if robots else []
         self._stage_of_hand = [
-            (robots.hands[number], poses.joints, _hand_frames(robots, number, poses))
+            (robots.hands[number], robots.joint_errors[number], _hand_frames(robots, number, poses))
             for number, poses in enumerate(self._poses)
             if robots
         ]
@@ -99,12 +99,15 @@ class ContactTransforms:
         stage = self._stage
         updated = np.concatenate([result.updated, result.framed]) if len(result.framed) else result.updated
         stage.begin_contacts(result.began.data, updated.data)
-        for hand, m, frames in self._stage_of_hand:
+        for hand, errors, frames in self._stage_of_hand:
             while sample_ns := stage.next_sample_ns(frames):  # one, unless pads are event-driven
-                joints = self.joints_at(hand, sample_ns) or JointSnapshot.unknown(sample_ns, m)
-                used = joints.position_rad, joints.age_s, joints.std_rad
-                self.used_joints.append((hand, sample_ns, *used))
-                stage.transform_contacts(frames, sample_ns, *map(view_memory, used))
+                joints = self.joints_at(hand, sample_ns) or JointSnapshot.unknown(
+                    sample_ns, len(errors.unstated)
+                )
+                positions, ages_s, stated = joints.position_rad, joints.age_s, joints.std_rad
+                self.used_joints.append((hand, sample_ns, positions, ages_s, stated))
+                used = map(view_memory, (positions, ages_s, errors.of(stated)))
+                stage.transform_contacts(frames, sample_ns, *used)
         self._groups.update_groups()
 
     def discard(self, rows: IntArray) -> None:
@@ -168,7 +171,6 @@ def _hand_frames(robots: RobotModels, number: int, poses: LinkPoses) -> HandFram
     masks = np.stack([kinematics.palm_joint_mask, kinematics.base_joint_mask])
     return HandFrames(
         *(poses, int(rows[0]), int(rows[-1]) + 1, view_memory(masks)),
-        *(view_memory(robots.joint_std[number]), view_memory(mounts.origin_m)),
+        *(view_memory(np.zeros(poses.joints)), view_memory(mounts.origin_m)),
         *(mounts.position_variance_m2, mounts.rotation_variance_rad2, robots.joints_stale_s[number]),
-        view_memory(np.zeros(poses.joints)),
     )

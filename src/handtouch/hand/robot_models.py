@@ -1,6 +1,6 @@
 """Kinematics and URDF checks of the hands of a deployment.
 
-Public names: `RobotModels`, `check_urdfs`, `drop_invalid_urdfs`, `unchecked_items`.
+Public names: `RobotModels`, `JointErrors`, `check_urdfs`, `drop_invalid_urdfs`, `unchecked_items`.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,7 @@ _OUTWARD_TEST_STEP_M = 0.003
 _KEYS_REQUIRING_URDF = (
     *("palm_link", "base_link", "joint_names", "joint_prefix"),
     *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
+    *("joint_backlash_deg", "joint_backlash_mm"),
 )
 _GRADIENT_STEP_M = 1e-5
 _MAX_SURFACE_STEPS = 50
@@ -48,14 +50,27 @@ _MIN_SLOPE = 0.1
 _MAX_PARALLEL = 0.9
 
 
+class JointErrors(NamedTuple):
+    """Standard deviations (m,) of a hand's joints [rad, m if prismatic]."""
+
+    unstated: FloatArray
+    """of those whose states carry none"""
+    backlash: FloatArray
+    """of the play, which no encoder sees: a part of all"""
+
+    def of(self, stated: FloatArray) -> FloatArray:
+        """Return the whole deviations (m,) for those that joint states carry, 0 or NaN where they don't."""
+        return np.hypot(np.where(stated > 0, stated, self.unstated), self.backlash)
+
+
 class RobotModels:
     """Kinematics of the hands that have a URDF; all attributes are lists over these hands.
 
     `hands`: names; `kinematics`; `pad_rows`: numbers of its pads among those of the deployment, in the order
     of the kinematics' links; `joint_names`: names of the kinematics' joints in joint states; `followers`: by
     their names in joint states; `joints_stale_s`, `group_distance_m`; `gravity`: unit vector (3,) in the base
-    frame; `mounts`: uncertainty of its mounts; `joint_std`: (m,) for joints whose states carry no deviation
-    [rad, m if prismatic]. Raises UrdfError, KeyError or OSError for errors that `check_urdfs` reports.
+    frame; `mounts`: uncertainty of its mounts; `joint_errors`. Raises UrdfError, KeyError or OSError for
+    errors that `check_urdfs` reports.
     """
 
     def __init__(self, deployment: Deployment) -> None:
@@ -67,7 +82,7 @@ class RobotModels:
         self.joints_stale_s: list[float] = []
         self.group_distance_m: list[float] = []
         self.mounts: list[MountUncertainty] = []
-        self.joint_std: list[FloatArray] = []
+        self.joint_errors: list[JointErrors] = []
         self.gravity: list[NDArray[np.float64]] = []
         first = 0
         for hand in deployment.hands:
@@ -92,7 +107,8 @@ class RobotModels:
                 self.mounts.append(MountUncertainty(hand))
                 slides = np.array([robot.joints[name].kind == "prismatic" for name in made.joints], np.bool_)
                 std = np.where(slides, hand.joint_std_mm * 1e-3, np.radians(hand.joint_std_deg))
-                self.joint_std.append(std)
+                play = np.where(slides, hand.joint_backlash_mm * 1e-3, np.radians(hand.joint_backlash_deg))
+                self.joint_errors.append(JointErrors(std, play / np.sqrt(12)))
                 self.gravity.append(np.array(hand.gravity) / np.linalg.norm(hand.gravity))
             first += len(hand.pads)
 

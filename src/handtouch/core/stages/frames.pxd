@@ -11,7 +11,7 @@ cdef class HandFrames:
     cdef kinematics.LinkPoses tree
     cdef Py_ssize_t first, stop
     cdef unsigned char[::1] masks
-    cdef double[::1] stds, mounts, used_stds
+    cdef double[::1] stds, mounts
     cdef double mount_variance, mount_rotation_variance, stale_s
 
 cdef class FrameStage:

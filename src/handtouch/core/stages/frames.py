@@ -29,9 +29,9 @@ class HandFrames:
     """Kinematics of one hand for `FrameStage`: pads `first` to `stop` are on its links, in their order.
 
     masks: (2 n m,) 1 for a joint on which the pose of a link in the palm depends; the same for the base.
-    stds: (m,) of joints whose states carry none. mounts: (n 3,) origins of the pads on their links [m].
+    stds: (m,) of the joints, those of the last call. mounts: (n 3,) origins of the pads on their links [m].
     mount_variance, mount_rotation_variance: of these in m^2 and rad^2, about each axis.
-    stale_s: age of joints beyond which a pose is stale. used_stds: (m,), working memory.
+    stale_s: age of joints beyond which a pose is stale.
     """
 
     def __init__(
@@ -45,12 +45,11 @@ class HandFrames:
         mount_variance: float,
         mount_rotation_variance: float,
         stale_s: float,
-        used_stds: memoryview[float],
     ) -> None:
         self.tree, self.first, self.stop = tree, first, stop
         self.masks, self.stds, self.mounts = masks, stds, mounts
         self.mount_variance, self.mount_rotation_variance = mount_variance, mount_rotation_variance
-        self.stale_s, self.used_stds = stale_s, used_stds
+        self.stale_s = stale_s
 
 
 class FrameStage:
@@ -117,7 +116,7 @@ class FrameStage:
         """Transform a hand's contacts sampled at a time, by positions, ages and deviations (m,) of joints."""
         hand.tree.set_joint_positions(positions)
         for joint in range(hand.tree.joints):
-            hand.used_stds[joint] = stds[joint] if stds[joint] > 0.0 else hand.stds[joint]
+            hand.stds[joint] = stds[joint]
         for pad in range(hand.first, hand.stop):
             if self.pending[pad] and self.sample_ns[pad] <= sample_ns:
                 self.pending[pad] = 0
@@ -185,9 +184,7 @@ def _transform(
     on_pad, row = pad * _VALUES, pad * _ROW + (_COUNT if in_base else 0)
     for i in range(9):
         stage.covariance[i] = 0.0
-    hand.tree.add_joint_covariance(
-        link, in_base, values, on_pad + _POSITION, hand.used_stds, stage.covariance
-    )
+    hand.tree.add_joint_covariance(link, in_base, values, on_pad + _POSITION, hand.stds, stage.covariance)
     if not in_base:
         for i in range(9):
             stage.rotation[9 * pad + i] = pose[i]
@@ -232,7 +229,7 @@ def _transform_parts(stage: FrameStage, hand: HandFrames, pad: int, in_base: boo
         for i in range(9):
             stage.covariance[i] = 0.0
         hand.tree.add_joint_covariance(
-            link, in_base, stage.parts, at + _PART_POSITION, hand.used_stds, stage.covariance
+            link, in_base, stage.parts, at + _PART_POSITION, hand.stds, stage.covariance
         )
         _write_in_frame(
             stage,
