@@ -57,11 +57,14 @@ from handtouch.device import DeviceBus
 
 GATEWAY = "gateway"
 """Act of a program of another stack, which the injected bus can't have."""
+SHORT_BYTES = 2
 ACCUSED = ("absent", "faulted")
 COMMON_CAUSE = re.compile(
     "as from every|no SYNC on bus|bus can|no answer within|are being checked|settings can't be read"
 )
 """Reasons that name the host or the bus, report silence without a cause, or wait for a check."""
+INJECTED_SHORT = f"its PDO has {SHORT_BYTES} bytes"
+"""Frames of the act `short`, if a node without processor time sends none of its own between them."""
 MISSED_PERIODS, RECENT_S = 2.5, 2.0
 SAMPLE_BYTES = 8
 
@@ -125,7 +128,8 @@ class Verdicts:
         if act == "down" and (new == "absent" or old == "absent") and "bus can" in reason:
             return
         if new in ACCUSED or (act not in ("nmt", GATEWAY, "down") and (left or new == "stale")):
-            self.record(act, f"{node}: {old} -> {new}: {reason}", was_starved and COMMON_CAUSE.search(reason))
+            named = COMMON_CAUSE.search(reason) or (act == "short" and INJECTED_SHORT in reason)
+            self.record(act, f"{node}: {old} -> {new}: {reason}", was_starved and named)
 
     def record(self, act: str, what: str, excused: object) -> None:
         """Record what may happen only for want of processor time."""
@@ -355,7 +359,9 @@ def _act_injected(hand: InjectedHand, act: str, generator: random.Random) -> Ite
             case "emcy":
                 bus.inject(cia301.EMCY + choose(NODES), b"\x00\x10\x00" + bytes(5))
             case "short":
-                bus.inject(choose((0x80, 0x280, 0x580, 0x700)) + choose(NODES), generator.randbytes(2))
+                bus.inject(
+                    choose((0x80, 0x280, 0x580, 0x700)) + choose(NODES), generator.randbytes(SHORT_BYTES)
+                )
 
     return hand.run(5.0, send)
 
@@ -483,7 +489,7 @@ def _act_guest(
         case "short":
             for _ in range(300):
                 base = generator.choice((0x80, 0x280, 0x580, 0x700))
-                send(base + generator.choice(ids), generator.randbytes(2))
+                send(base + generator.choice(ids), generator.randbytes(SHORT_BYTES))
         case "pause":
             daemon.send_signal(signal.SIGSTOP)
             time.sleep(generator.choice((0.3, 0.6, 2.0)))

@@ -182,6 +182,25 @@ def test_every_change_of_a_heartbeat_time_is_repaired_soon_and_no_other_cause_is
             assert rig.status(1).reason == "", heartbeat_ms
 
 
+@pytest.mark.parametrize("silent_ms", [700, 1200, 2500])
+def test_a_changed_heartbeat_time_is_reported_soon_after_checks_for_another_cause(
+    make_rig: Make, silent_ms: int
+) -> None:
+    rig = make_rig(2)
+    rig.boot()
+    rig.node(1).send_data = False
+    rig.run(silent_ms)  # its settings are checked, again and again
+    assert rig.state(1) is NodeState.STALE
+    rig.node(1).send_data = True
+    rig.run(100)
+    rig.node(1).write_object(0x1017, 0, 0)
+    reasons = {event.reason for event in rig.run(900)}
+    assert any("0x1017:00, heartbeat time, is 0 instead of 100" in reason for reason in reasons)
+    rig.run(1000)
+    assert rig.node(1).read_object(0x1017, 0) == 100
+    assert (rig.state(1), rig.status(1).reason) == (NodeState.OPERATIONAL, "")
+
+
 def test_nodes_that_boot_together_with_one_cob_id_are_both_faulted_and_neither_is_stale(
     make_rig: Make,
 ) -> None:

@@ -123,9 +123,11 @@ def on_heartbeat_timeout(
 def on_slow_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Transition:
     """Handle a heartbeat that is late while the node's samples arrive: it is present.
 
-    Its heartbeat time may have been changed: the settings are checked, and again at intervals.
+    Its heartbeat time may have been changed: the settings are checked at once, and again at intervals. A
+    check for another cause says nothing of this one.
     """
-    life = life._replace(last_heartbeat_ns=now_ns, is_heartbeat_slow=True)
+    check_ns = life.check_ns if life.is_heartbeat_slow else now_ns
+    life = life._replace(last_heartbeat_ns=now_ns, is_heartbeat_slow=True, check_ns=check_ns)
     return _check_settings(_with_heartbeat_reason(life, timing), now_ns, timing)
 
 
@@ -157,8 +159,7 @@ def measure_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifec
         return life
     if 0 < gap_ns <= timing.heartbeat_timeout_ns:
         reason = "" if _SLOW_HEARTBEAT in life.reason else life.reason
-        check_ns = min(life.check_ns, now_ns + timing.retry_delay_ns(3))  # if it becomes slow again
-        return life._replace(is_heartbeat_slow=False, reason=reason, check_ns=check_ns)
+        return life._replace(is_heartbeat_slow=False, reason=reason)
     return _with_heartbeat_reason(life, timing)
 
 
