@@ -313,7 +313,11 @@ def test_responses_for_other_objects_are_ignored() -> None:
 
 @pytest.mark.parametrize(
     ("response", "received"),
-    [("4310", "43 10"), ("", "no data"), ("43001000 91010f00", "43 00 10 00 91 01 0f 00")],
+    [
+        ("4310", "43 10, 2 bytes instead of 8"),
+        ("", "no data, 0 bytes instead of 8"),
+        ("43001000 91010f00", "43 00 10 00 91 01 0f 00"),
+    ],
 )
 def test_timeout_after_invalid_responses_names_the_last_one(response: str, received: str) -> None:
     node = Node({(0x1017, 0): (100, 2)})

@@ -193,6 +193,7 @@ def test_log_whose_stamps_do_not_advance_is_refused(deployment: Deployment, tmp_
     log = _rewritten(tmp_path, lambda _, __: 0.0)
     with pytest.raises(ValueError, match="stamps don't advance"):
         replay_log(log, deployment, lambda _: None)
+    assert main(["replay", str(log), str(shipped.path("utah_mit.toml"))]) == 2
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,7 @@ def test_stamps_that_go_back_continue_with_a_warning(
 
 
 def test_frames_of_a_foreign_channel_belong_to_no_pad_where_the_log_has_the_buss(
-    deployment: Deployment, tmp_path: Path
+    deployment: Deployment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (bus,) = deployment.buses
     own = deployment.model_copy(update={"buses": (bus.model_copy(update={"channel": "can0"}),)})
@@ -227,3 +228,5 @@ def test_frames_of_a_foreign_channel_belong_to_no_pad_where_the_log_has_the_buss
     summary = replay_log(both, own, lambda _: None)
     assert summary.samples == 0
     assert summary.unmatched["can1"] > 0
+    assert main(["replay", str(both), str(shipped.path("utah_mit.toml"))]) == 1
+    assert "can1 (" in capsys.readouterr().err

@@ -126,7 +126,7 @@ def run(
         if report:
             raise CommandError("--report is for MCAP recordings; a CAN log has no contacts to compare", 2)
         publisher, pace = _open_publisher(deployment, settings, speed, stack)
-        with _progress_shown(pace) as shown:
+        with _progress_shown(pace) as shown, failing(2, ValueError):
             summary = replay_log(path, deployment, on_contact, pace=shown, publisher=publisher)
         return _print_log_summary(summary, path, config_path)
 
@@ -261,12 +261,13 @@ def _print_log_summary(summary: LogReplaySummary, path: Path, config_path: Path 
     )
     for warning in summary.warnings:
         print(f"{path}: {warning}", file=sys.stderr)
+    if summary.unmatched:
+        channels = ", ".join(f"{channel} ({count} frames)" for channel, count in summary.unmatched.items())
+        print(f"{path}: channels of the log without a bus in {config_path}: {channels}", file=sys.stderr)
     if summary.samples:
         return 0
-    channels = ", ".join(f"{channel} ({count} frames)" for channel, count in summary.unmatched.items())
     print(
-        f"{path}: no frame is a sample of {config_path}; check the channels of its buses and its node ids"
-        + (f". Channels of the log without a bus: {channels}" if channels else ""),
+        f"{path}: no frame is a sample of {config_path}; check the channels of its buses and its node ids",
         file=sys.stderr,
     )
     return 1

@@ -235,7 +235,9 @@ class SdoTransport:
                 f"no answer {limit}, but a late one to an earlier request, 0x{index:04X}:{sub:02X}; "
                 "is the node, the bus or this host overloaded?"
             )
-        return f"no valid SDO response {limit}; received: {dropped.hex(' ') or 'no data'}"
+        expected = cia301.SDO_BYTES
+        size = "" if len(dropped) == expected else f", {len(dropped)} bytes instead of {expected}"
+        return f"no valid SDO response {limit}; received: {dropped.hex(' ') or 'no data'}{size}"
 
 
 def _tpdo_parameter(number: int, sub: int) -> tuple[int, int, str]:
