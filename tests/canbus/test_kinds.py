@@ -179,7 +179,29 @@ def test_channel_of_another_width_than_configured_is_a_fault(make_rig: Make) -> 
     rig.start()
     rig.run(200)
     assert rig.state(1) is NodeState.FAULTED
-    assert "TPDO2 carries 0x8130:03 (32 bit) with 24 bits; correct its type" in rig.status(1).reason
+    assert (
+        "TPDO2 carries 0x8130:03 (32 bit) with 24 bits; write its type, 0x8130:3:i24" in rig.status(1).reason
+    )
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_mapping_may_carry_the_low_bits_of_a_wider_object(
+    make_rig: Make, tmp_path: Path, strict: bool
+) -> None:
+    text = (FOLDER / "hapt24.dcf").read_text()
+    wide = tmp_path / "wide.dcf"
+    wide.write_text(text.replace("DataType=0x0010", "DataType=0x0004"))
+    assert wide.read_text() != text
+    channels = resolve_channels([f"0x8130:{number}:i24" for number in (1, 2, 3, 4)], wide)
+    assert {channel.bits for channel in channels} == {24}
+    device = {"eds": str(wide), "channels": tuple((c.index, c.sub) for c in channels), "strict_pdo": strict}
+    rig = make_rig(2, device=device, eds=str(wide), channels=channels)
+    rig.counts[:] = KINDS["hapt24.dcf"][1]
+    rig.boot()
+    rig.run(10)
+    assert rig.slab.unpack_counts().tolist() == [list(KINDS["hapt24.dcf"][1])] * 2
+    with pytest.raises(EdsError, match="has i32"):
+        resolve_channels(["0x8130:1:u24", "0x8130:2", "0x8130:3", "0x8130:4"], wide)
 
 
 def test_listener_takes_the_mapping_from_the_eds_or_reports_why_not(make_rig: Make) -> None:

@@ -133,8 +133,9 @@ def parse_object(text: str) -> tuple[int, int, ValueType | None, float | None]:
 def resolve_channels(objects: Sequence[str], path: Path | str | None) -> Channels:
     """Return the four channels of a kind of node, with types from the text, the EDS or the CiA profiles.
 
-    Raises EdsError for a form unknown to `parse_object`, an object given twice, an unreadable EDS, and a type
-    that is unknown, neither an integer nor REAL32, wider than 32 bits or contradicts the EDS.
+    A type may be narrower than that in the EDS: a PDO carries the low bits. Raises EdsError for a form
+    unknown to `parse_object`, an object given twice, an unreadable EDS, and a type that is unknown, neither
+    an integer nor REAL32, wider than 32 bits or contradicts the EDS.
     """
     dictionary = eds.load_eds(path, 1) if path else None
     channels: list[Channel] = []
@@ -143,7 +144,7 @@ def resolve_channels(objects: Sequence[str], path: Path | str | None) -> Channel
         listed = eds.value_type(dictionary, index, sub) if dictionary is not None else None
         if dictionary is not None and listed is None and given is None:
             raise eds.EdsError(f'"{text}": {path} has no such object; correct the object or the EDS')
-        if given and listed and given != listed:
+        if given and listed and given != listed and not _is_low_part(given, listed):
             raise eds.EdsError(f'"{text}": {path} has {listed}; leave the type out, or correct the EDS')
         kind = given or listed or PROFILE_TYPES.get(index)
         if kind is None:
@@ -156,6 +157,12 @@ def resolve_channels(objects: Sequence[str], path: Path | str | None) -> Channel
             raise eds.EdsError(f'"{text}" is given twice; each channel needs its own object')
         channels.append(Channel(index, sub, kind.bits, kind.signed, counts_per_unit))
     return tuple(channels)
+
+
+def _is_low_part(given: ValueType, whole: ValueType) -> bool:
+    """Return True for the low bits of a wider integer, which a PDO may carry instead of all."""
+    integers = not given.is_real and not whole.is_real and given.signed == whole.signed
+    return integers and given.bits < whole.bits
 
 
 def parse_writable_object(text: str) -> WritableObject:

@@ -207,7 +207,8 @@ def _channel_offsets(tpdo: NodeTpdo, channels: Channels) -> list[tuple[Channel, 
         channel = by_object.get(entry >> 8)
         if channel is not None and entry & 0xFF != channel.bits:
             raise BootStepError(
-                f"TPDO{tpdo.number} carries {channel} with {entry & 0xFF} bits; correct its type"
+                f"TPDO{tpdo.number} carries {channel} with {entry & 0xFF} bits; write its type, "
+                f"0x{channel.index:04X}:{channel.sub}:{'i' if channel.signed else 'u'}{entry & 0xFF}"
             )
         if channel is not None:
             offsets.append((channel, bit))
