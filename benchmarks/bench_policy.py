@@ -88,6 +88,7 @@ def episode(
     """Run an episode in real time; return its cost, final force and whether the object was dropped."""
     cost, due_s = 0.0, time.monotonic()
     for _ in range(EPISODE_STEPS):
+        hand.latest()
         action = policy.act(TOUCH.of(hand)[None], np.array([scene.force_n]))
         cost -= scene.step(float(action[0, 0]))
         nodes.update(scene.data)

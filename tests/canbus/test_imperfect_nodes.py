@@ -133,6 +133,19 @@ def test_slow_heartbeat_is_measured_and_its_remedy_named(make_rig: Make) -> None
     assert "raise heartbeat_timeout_ms" in rig.status(1).reason
 
 
+def test_a_slow_heartbeats_reason_stays_while_its_period_jitters(make_rig: Make) -> None:
+    rig = make_rig(1)
+    rig.boot()
+    rig.node(1).send_heartbeat = False
+    events = []
+    rig.inject(0x701, b"\x05")
+    for late_ms in (0, 7, -9, 12, -15, 15, -4):
+        events += rig.run(1000 + late_ms)
+        rig.inject(0x701, b"\x05")
+    measured = {event.reason for event in events if "slow heartbeat: every" in event.reason}
+    assert len(measured) == 1, measured
+
+
 def test_fast_heartbeat_is_measured_and_is_no_twin(make_rig: Make) -> None:
     rig = make_rig(2)
     rig.boot()

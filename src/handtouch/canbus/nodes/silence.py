@@ -25,6 +25,8 @@ _SLOW_HEARTBEAT, _FAST_HEARTBEAT = "slow heartbeat", "fast heartbeat"
 _TPDO_REMEDY = "check transmission type and COB-ID of its TPDO (0x1800 to 0x19FF)"
 _CHECK_PENDING = "its PDO and heartbeat settings are being checked"
 
+_GAP_JITTER = 0.02
+"""Relative change of the time between two heartbeats that is none: 1 % was seen of timers of 10 ms"""
 BUS_CAUSE_DELAY_NS = 1_000_000_000
 """Time until the cause is sought in a node whose silence began together with that of others"""
 
@@ -154,6 +156,8 @@ def end_fast_heartbeat(life: Lifecycle) -> Lifecycle:
 def measure_heartbeat(life: Lifecycle, now_ns: int, timing: NodeTiming) -> Lifecycle:
     """Note the time between two heartbeats; end a report of slow ones when they come in time."""
     gap_ns = 0 if life.heartbeat_ns is None else now_ns - life.heartbeat_ns
+    if abs(gap_ns - life.heartbeat_gap_ns) < _GAP_JITTER * life.heartbeat_gap_ns:
+        gap_ns = life.heartbeat_gap_ns  # so that a reason doesn't change with each heartbeat
     life = life._replace(heartbeat_ns=now_ns, heartbeat_gap_ns=gap_ns)
     if not life.is_heartbeat_slow:
         return life
