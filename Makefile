@@ -28,7 +28,8 @@ UV := $(shell command -v uv 2>/dev/null)
 PIP_LOCKED := $(PIP) install --no-compile --require-hashes --no-deps
 LOCKED = install() { $(if $(UV),$(UV) pip install --quiet --python $(BIN)/python --require-hashes --no-deps "$$@" \
 	2>/dev/null ||) $(PIP_LOCKED) "$$@"; }; install
-HANDTOUCH := $(PIP) install --no-compile --no-deps --no-build-isolation -e .
+HANDTOUCH := $(if $(UV),$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation -e . 2>/dev/null ||) \
+	$(PIP) install --no-compile --no-deps --no-build-isolation -e .
 # with progress, before pip builds the package in silence; without a compiler it says what is missing
 COMPILE := $(BIN)/python src/handtouch/core/build.py || test "$(CI)" != true
 

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from handtouch.cli import build_parser
-from handtouch.core.compiled import STAGES
+from handtouch.core.compiled import MODULES
 
 from .conftest import ROOT, Installation, copy_compiled
 
@@ -125,7 +125,7 @@ def test_the_build_stage_makes_a_compiled_wheel(tmp_path: Path) -> None:
     (made,) = (tmp_path / "wheels").iterdir()
     with zipfile.ZipFile(made) as opened:
         compiled = [name for name in opened.namelist() if "/_compiled/" in name]
-    assert len(compiled) == len(STAGES)
+    assert len(compiled) == len(MODULES)
 
 
 def test_image_installs_like_a_controller(wheel: Path, tmp_path: Path) -> None:

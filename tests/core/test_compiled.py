@@ -118,13 +118,14 @@ def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_cl
     cache = copied.parent / "cache"
     done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(cache))
     assert done.returncode == 0, done.stderr
-    after = {path.name: path.stat().st_ino for path in folder.iterdir()}
+    after = {path.name: path.stat().st_ino for path in folder.glob("*.so")}
     assert len(after) == len(files)
     assert untouched.items() <= after.items()
     assert files["groups"].name not in after
     assert files["tables"].read_bytes() == tables
     assert run("-c", STATE, source=copied).stdout.split()[:2] == ["True", "True"]
-    reused = list((cache / "handtouch/compiled").iterdir())
+    (of_version,) = (cache / "handtouch/compiled").iterdir()
+    reused = list(of_version.iterdir())
     assert {path.name.partition("-")[0] for path in reused} == {"tables", "groups"}
     for path in reused:
         (folder / path.name).unlink()
@@ -151,3 +152,16 @@ def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -
     compiled, used, *reason = run("-c", STATE, source=copied).stdout.split()
     assert (compiled, used) == ("False", "False")
     assert "never compiled" in " ".join(reason)
+
+
+@needs_compiled
+def test_modules_of_another_version_of_cython_are_never_mixed(copied: Path) -> None:
+    folder = copied / "handtouch/core/stages/_compiled"
+    before = {path.name: path.stat().st_ino for path in folder.glob("*.so")}
+    (folder / "cython.txt").write_text("3.2.0")
+    next(folder.glob("tables-*")).unlink()
+    done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(copied.parent / "cache"))
+    assert done.returncode == 0, done.stderr
+    after = {path.name: path.stat().st_ino for path in folder.glob("*.so")}
+    assert after.keys() == before.keys()
+    assert not set(after.values()) & set(before.values())

@@ -7,6 +7,7 @@ headers, and nothing else of handtouch, so that a build of the package can use i
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import importlib.util
 import os
 import re
@@ -43,24 +44,34 @@ def build_stages(
     Files of other sources are removed. Equal sources and compilers give equal bytes, in any folder. With
     `machine`, x86_64 or aarch64, the files are for any Linux on it that has MIN_GLIBC, and are in the folder
     `build` beside `source`. With `cache`, files that were compiled of the same sources before are taken from
-    that folder, and new ones put into it. Raises BuildError.
+    that folder, and new ones put into it. Files of another version of Cython are compiled again. Raises
+    BuildError.
 
     A machine's own Python.h isn't needed: within the stable ABI, it is the same on all 64-bit Linux.
     """
     compiled = _load_compiled(source)
-    files = [compiled.compiled_file(name, f"linux_{machine}" if machine else "") for name in compiled.STAGES]
+    names = compiled.MODULES
+    files = [compiled.compiled_file(name, f"linux_{machine}" if machine else "") for name in names]
     if machine:
         files = [source.parent / "build" / machine / file.name for file in files]
     for old in set(files[0].parent.glob("*.so")) - set(files):
         old.unlink()
     files[0].parent.mkdir(parents=True, exist_ok=True)
-    missing = [(name, file) for name, file in zip(compiled.STAGES, files, strict=True) if not file.exists()]
+    if all(file.exists() for file in files):
+        return files
+    version, stamp = _cython_version(), files[0].parent / "cython.txt"
+    if version != (stamp.read_text() if stamp.exists() else ""):
+        for file in files:  # they share a module, which must be of their version
+            file.unlink(missing_ok=True)
+        stamp.write_text(version)
+    cache = cache and cache / f"cython-{version}"
+    missing = [(name, file) for name, file in zip(names, files, strict=True) if not file.exists()]
     missing = [(name, file) for name, file in missing if not _copy(cache, file)]
     if not missing:
         return files
     on_progress(f"compiling {len(missing)} modules of the core")
     compiler, include = _find_compiler(machine), sysconfig.get_path("include")
-    if importlib.util.find_spec("Cython") is None:
+    if not version:
         raise BuildError("Cython is missing; pip install cython")
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
@@ -70,9 +81,13 @@ def build_stages(
     def compile_stage(stage: tuple[str, Path]) -> None:
         name, file = stage
         with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=file.parent) as work:
-            options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
-            source_file = f"handtouch/core/stages/{name}.py"
-            _run([*cython, *options, "-o", f"{work}/{name}.c", source_file], source)
+            if name == compiled.SHARED:
+                _run([*cython, f"--generate-shared={work}/{name}.c"], source)
+            else:
+                options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
+                shared = f"--shared=handtouch.core.stages.{compiled.SHARED}"
+                source_file = f"handtouch/core/stages/{name}.py"
+                _run([*cython, *options, shared, "-o", f"{work}/{name}.c", source_file], source)
             _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], Path(work))  # its path is in no file
             built = Path(work) / f"{name}.so"
             if machine:
@@ -153,6 +168,14 @@ def _load_compiled(source: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def _cython_version() -> str:
+    """Return Cython's version, empty where it is missing."""
+    try:
+        return importlib.metadata.version("cython")
+    except importlib.metadata.PackageNotFoundError:
+        return ""
 
 
 def _find_compiler(machine: str) -> list[str]:
