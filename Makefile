@@ -35,8 +35,9 @@ COMPILE := $(BIN)/python src/handtouch/core/build.py || test "$(CI)" != true
 
 $(VENV)/.run: pyproject.toml locks/run.lock locks/build.lock | $(BIN)/python
 	@echo "installing packages into $(VENV) ..."
-	@$(LOCKED) -r locks/run.lock -r locks/build.lock
-	@$(COMPILE)
+	@$(LOCKED) -r locks/build.lock
+	@{ $(COMPILE); } & compiling=$$!; $(LOCKED) -r locks/run.lock; installed=$$?; \
+		wait $$compiling && exit $$installed
 	@$(HANDTOUCH)
 	@touch $@
 
