@@ -16,7 +16,7 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
@@ -75,31 +75,40 @@ def build_stages(
         raise BuildError("Cython is missing; pip install cython")
     if not (Path(include) / "Python.h").exists():
         raise BuildError(f"{include}/Python.h is missing; on Debian: apt-get install python3-dev")
-    cython = [sys.executable, "-c", compiled.CYTHON]
     command = [*compiler, *compiled.FLAGS, *compiled.LIMITED_API, f"-I{include}"]
+    processors = len(os.sched_getaffinity(0))
+    with (
+        tempfile.TemporaryDirectory(prefix="work-", dir=files[0].parent) as folder,
+        ThreadPoolExecutor(processors) as pool,
+    ):
+        work = Path(folder)
 
-    def compile_stage(stage: tuple[str, Path]) -> None:
-        name, file = stage
-        with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=file.parent) as work:
-            if name == compiled.SHARED:
-                _run([*cython, f"--generate-shared={work}/{name}.c"], source)
-            else:
-                options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
-                shared = f"--shared=handtouch.core.stages.{compiled.SHARED}"
-                source_file = f"handtouch/core/stages/{name}.py"
-                _run([*cython, *options, shared, "-o", f"{work}/{name}.c", source_file], source)
-            _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], Path(work))  # its path is in no file
-            built = Path(work) / f"{name}.so"
+        def compile_module(module: tuple[str, Path]) -> None:
+            name, file = module
+            _run([*command, f"{name}.c", "-o", f"{name}.so", "-lm"], work)  # its path is in no file
+            built = work / f"{name}.so"
             if machine:
                 _check_portable(built, machine)
             built.replace(file)  # never half written where another process loads it
-        on_progress(f"compiled {name}")
-        _keep(cache, file)
+            on_progress(f"compiled {name}")
+            _keep(cache, file)
 
-    compile_stage(missing[0])  # by itself: what fails here would fail for all
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(compile_stage, missing[1:]))
+        parts = [missing[first::processors] for first in range(processors)]
+        list(pool.map(lambda part: _translate(compiled, [name for name, _ in part], source, work), parts))
+        compile_module(missing[0])  # by itself: what fails here would fail for all
+        list(pool.map(compile_module, missing[1:]))
     return files
+
+
+def _translate(compiled: ModuleType, names: Sequence[str], source: Path, folder: Path) -> None:
+    """Translate modules to C, into a folder."""
+    cython = [sys.executable, "-c", compiled.CYTHON]
+    if compiled.SHARED in names:
+        _run([*cython, f"--generate-shared={folder}/{compiled.SHARED}.c"], source)
+    if stages := [f"handtouch/core/stages/{name}.py" for name in names if name != compiled.SHARED]:
+        options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
+        shared = f"--shared=handtouch.core.stages.{compiled.SHARED}"
+        _run([*cython, *options, shared, "-o", str(folder), *stages], source)
 
 
 def main() -> int:
