@@ -45,6 +45,7 @@ from learn_grip import CANDIDATES, TRAINED, WEIGHT_M_S2, GripPolicy, Outcome, le
 
 FloatArray = NDArray[np.float64]
 WORLD, PORT = "default", 43998
+LEARNED_WITH = 1  # seed of a sensor, of the family for tuning
 GENERATIONS, SENSORS, OBJECTS = 6, 4, 20
 CLEAR_TIMEOUT_S = 30.0
 
@@ -135,7 +136,7 @@ def main() -> int:
     in_own_network()
     generations, sensors, count = (1, 1, 4) if asked.quick else (GENERATIONS, SENSORS, OBJECTS)
     report = Report(asked.quick, generations=generations, sensors=sensors, objects=count)
-    tuning = GripEnvironments(CANDIDATES * len(TRAINED), WORLD, Family.TUNING.seed(1))
+    tuning = GripEnvironments(CANDIDATES * len(TRAINED), WORLD, LEARNED_WITH)
     objects, rows, shares = other_objects(count), [], {}
     needed_n = 0.5 * WEIGHT_M_S2 * objects[0] / objects[1]
     for name, touch in (("with touch", True), ("constant", False)):

@@ -69,7 +69,7 @@ class PalmDifferences:
         the deployment's. Raises ValueError for a contact without a position in the palm, LookupError for a
         link or joint that is missing.
         """
-        if first.palm_covariance_m2 is None or second.palm_covariance_m2 is None:
+        if None in (first.palm_position_m, second.palm_position_m):
             raise ValueError(
                 f"palm_status of {first.link} and {second.link} is {first.palm_status} and "
                 f"{second.palm_status}: both must be valid"
@@ -79,9 +79,9 @@ class PalmDifferences:
         std = self._errors.of(sent)
         one, other = (self._derivative(contact, positions) * std for contact in (first, second))
         common = one @ other.T
-        apart = np.add(first.palm_covariance_m2, second.palm_covariance_m2).reshape(3, 3)
+        apart = np.array(first.palm_covariance_m2) + np.array(second.palm_covariance_m2)
         vector_m = np.array(first.palm_position_m) - np.array(second.palm_position_m)
-        return Difference(vector_m, apart - common - common.T)
+        return Difference(vector_m, apart.reshape(3, 3) - common - common.T)
 
     def _derivative(self, contact: wire.Contact, positions: FloatArray) -> FloatArray:
         """Return the derivative (3, joints) of a contact's position in the palm by the joint positions."""

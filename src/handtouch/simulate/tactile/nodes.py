@@ -16,9 +16,8 @@ from handtouch import config
 from handtouch.canbus.bus.port import open_bus
 from handtouch.simulate.simulated_hand import NodesOnBus
 from handtouch.simulate.tactile.mujoco_contacts import NO_POINTS, ContactReader
-from handtouch.simulate.tactile.sensor import world_named
 from handtouch.simulate.tactile.simulated_pads import SimulatedPads
-from handtouch.simulate.worlds import World
+from handtouch.simulate.worlds import World, world_named
 
 
 class TactileNodes:

@@ -1,6 +1,6 @@
 """Touch of a hand in a MuJoCo simulation: the arrays that the daemon would publish, without a bus or daemon.
 
-Public names: `TactileSensor`, `world_named`.
+Public name: `TactileSensor`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from handtouch.core.slab import CountSlab
 from handtouch.simulate.tactile.mujoco_contacts import NO_POINTS, ContactReader, LinkPoints
 from handtouch.simulate.tactile.reading import TactileReading
 from handtouch.simulate.tactile.simulated_pads import SimulatedPads
-from handtouch.simulate.worlds import WORLDS, World
+from handtouch.simulate.worlds import World, world_named
 from handtouch.wire import PadState
 
 _HANDS_PER_PIPELINE = 16
@@ -265,12 +265,3 @@ def _channel_limits(deployment: config.Deployment) -> NDArray[np.int64]:
         ],
         np.int64,
     )
-
-
-def world_named(world: str | World) -> World:
-    """Return a world by its name. Raises ValueError for an unknown one."""
-    if isinstance(world, World):
-        return world
-    if world not in WORLDS:
-        raise ValueError(f'there is no world "{world}"; known: {", ".join(WORLDS)}')
-    return WORLDS[world]

@@ -13,7 +13,7 @@ from handtouch.simulate.worlds.distributions import (
     Uniform,
 )
 from handtouch.simulate.worlds.families import Family
-from handtouch.simulate.worlds.named import WORLDS, world_with
+from handtouch.simulate.worlds.named import WORLDS, world_named, world_with
 from handtouch.simulate.worlds.shear_spread import HiddenShear, ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
 from handtouch.simulate.worlds.spreads import (
@@ -59,5 +59,6 @@ __all__ = [
     "SheetSpread",
     "Uniform",
     "World",
+    "world_named",
     "world_with",
 ]

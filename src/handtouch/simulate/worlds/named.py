@@ -1,6 +1,6 @@
 """The named worlds. docs/worlds.md states the source of each number.
 
-Public names: `WORLDS`, `world_with`.
+Public names: `WORLDS`, `world_named`, `world_with`.
 """
 
 from __future__ import annotations
@@ -165,3 +165,12 @@ def world_with(world: World, *, sheet: str | None = None, drift: bool = False) -
     if drift and world.electronics == ElectronicsSpread():
         world = replace(world, electronics=replace(_DEFAULT.electronics, noise_ratio=ONE))
     return world
+
+
+def world_named(world: str | World) -> World:
+    """Return a world by its name. Raises ValueError for an unknown one."""
+    if isinstance(world, World):
+        return world
+    if world not in WORLDS:
+        raise ValueError(f'there is no world "{world}"; known: {", ".join(WORLDS)}')
+    return WORLDS[world]
