@@ -7,6 +7,8 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -224,22 +226,22 @@ class DeviceBus:
         due_ns = self.advance(now_ns)
         if due_ns is not None:
             timeout_s = min(timeout_s, max(0.0, (due_ns - now_ns) * 1e-9))
-        frame = self._bus.recv(timeout_s)
+        first = self._bus.recv(timeout_s)
         self.advance(self._clock())
-        frames: list[can.Message] = []
-        while frame is not None and len(frames) < _MAX_FRAMES_AT_ONCE:
-            frames.append(frame)
-            frame = self._bus.recv(0.0)
-        for received in self._without_stale_syncs(frames if frame is None else [*frames, frame]):
+        if first is None:
+            return
+        others = islice(iter(partial(self._bus.recv, 0.0), None), _MAX_FRAMES_AT_ONCE)
+        for frame in self._without_stale_syncs([first, *others]):
             now_ns = self._clock()
-            self.handle_frame(received, now_ns)
+            self.handle_frame(frame, now_ns)
             self.advance(now_ns)  # a flood of frames must not delay heartbeats
 
     def _without_stale_syncs(self, frames: list[can.Message]) -> list[can.Message]:
-        stale = [k for k, frame in enumerate(frames) if frame.arbitration_id == cia301.SYNC][
-            :-_MAX_WAITING_SYNCS
-        ]
-        if stale and not self.skipped_syncs:
+        syncs = [k for k, frame in enumerate(frames) if frame.arbitration_id == cia301.SYNC]
+        stale = set(syncs[:-_MAX_WAITING_SYNCS])
+        if not stale:
+            return frames
+        if not self.skipped_syncs:
             _log.warning("nodes don't keep up with SYNC: %d not answered; lower its rate", len(stale))
         self.skipped_syncs += len(stale)
         return [frame for k, frame in enumerate(frames) if k not in stale]

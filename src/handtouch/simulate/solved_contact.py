@@ -146,12 +146,12 @@ class PatchNodes(NamedTuple):
     def centres(self, shape: SimulatedSurface, position: FloatArray) -> FloatArray:
         """Return the centres (2, k) of the pressure on the pad, fractions of it, of patches on one pad."""
         place_m = (self.place_m * (self.area_m2 * self.pressure)[:, None]).sum(axis=2, keepdims=True)
-        return shape.fractions_beside(position, place_m / _stretch(shape))[:, :, 0].T
+        return shape.fractions_beside(position, place_m / _stretch(shape.stretch))[:, :, 0].T
 
 
-def _stretch(shape: SimulatedSurface) -> FloatArray:
+def _stretch(ratio: float) -> FloatArray:
     """Return the lengths (2, 1) along x and y in the isotropic equivalent of a sheet."""
-    return np.array([[shape.stretch], [1.0]])
+    return np.array([[ratio], [1.0]])
 
 
 class _Form(NamedTuple):
@@ -168,7 +168,7 @@ class _Form(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _form(elongation: float, direction_rad: float, number: float, stretch: float) -> _Form:
-    profile, lengths = _profile(int(number)), np.array([[stretch], [1.0]])
+    profile, lengths = _profile(int(number)), _stretch(stretch)
     axes = half_axes(np.array([[1.0], [elongation], [direction_rad]]))
     return _Form(profile, axes[0], lengths, _log_own(lengths * axes, profile)[0])
 

@@ -15,6 +15,7 @@ from handtouch.canbus import cia301
 from handtouch.canbus.objects.sdo import BootStepError, NodeSdoClient
 from handtouch.config import eds
 from handtouch.config.channels import Channel, Channels
+from handtouch.config.eds import ValueType
 from handtouch.core.slab import PDO_BYTES, ChannelField, ChannelLayout
 
 DEFAULT_TPDO_NUMBERS = (2, 1, 3, 4)
@@ -208,7 +209,7 @@ def _channel_offsets(tpdo: NodeTpdo, channels: Channels) -> list[tuple[Channel, 
         if channel is not None and entry & 0xFF != channel.bits:
             raise BootStepError(
                 f"TPDO{tpdo.number} carries {channel} with {entry & 0xFF} bits; write its type, "
-                f"0x{channel.index:04X}:{channel.sub}:{'i' if channel.signed else 'u'}{entry & 0xFF}"
+                f"0x{channel.index:04X}:{channel.sub}:{ValueType(entry & 0xFF, channel.signed)}"
             )
         if channel is not None:
             offsets.append((channel, bit))
