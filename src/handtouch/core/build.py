@@ -60,7 +60,7 @@ def build_stages(
     if all(file.exists() for file in files):
         return files
     version, stamp = _cython_version(), files[0].parent / "cython.txt"
-    if version != (stamp.read_text() if stamp.exists() else ""):
+    if version and version != (stamp.read_text() if stamp.exists() else ""):
         for file in files:  # they share a module, which must be of their version
             file.unlink(missing_ok=True)
         stamp.write_text(version)

@@ -104,11 +104,6 @@ class Port:
         return self.router.bus_state
 
     @property
-    def is_cableless(self) -> bool:
-        """True if the bus is between programs, without a cable that may be at fault."""
-        return self.bus.is_cableless
-
-    @property
     def problem(self) -> str:
         """Problem of the bus (interface down, bus-off ...) and its remedy; empty if there is none."""
         return self.bus_state.problem

@@ -79,7 +79,7 @@ class BusCauses:
         if not self._sync_period_ns or silent_ns <= _MISSED_SYNC_PERIODS * self._sync_period_ns:
             return ""
         since = f" for {silent_ns / 1e6:.0f} ms" if port.last_sync_ns else " yet"
-        cable = "" if port.is_cableless else " and cable"
+        cable = "" if port.bus.is_cableless else " and cable"
         return f"no SYNC on bus {port.name}{since}; check its SYNC producer{cable}"
 
     def _describe_pause(self, silent_ns: int, now_ns: int) -> str:
@@ -91,4 +91,4 @@ class BusCauses:
 
 
 def _remedy(port: Port) -> str:
-    return _SIMULATED_REMEDY if port.is_cableless else _BUS_REMEDY
+    return _SIMULATED_REMEDY if port.bus.is_cableless else _BUS_REMEDY

@@ -114,7 +114,7 @@ def make_managed_node(spec: NodeSpec, ports: Mapping[str, Port], sync_period_ns:
         settle_timeout_ns=max(1_000_000_000, 2 * sync_period_ns),
         role=BusRole(port.bus.role),
         allow_nmt_reset=spec.allow_nmt_reset,
-        connection_remedy=CABLELESS_REMEDY if port.is_cableless else CONNECTION_REMEDY,
+        connection_remedy=CABLELESS_REMEDY if port.bus.is_cableless else CONNECTION_REMEDY,
     )
     sdo = SdoTransport(spec.node_id, port.send, received_until_ns=lambda: port.received_until_ns)
     node = ManagedNode(spec, port, timing, tpdo_numbers(spec.eds, spec.channels), sdo)
