@@ -5,6 +5,12 @@ pad of the reporting family: tared, loaded 3 times for 0.1 to 3 s by up to 3 N a
 mm off the centre at most; then one load is scored. The contact above is known with 1 mm and 10 %. *As built*:
 stated tolerances of parts only; *calibrated*: by four loads of 2 N, known to 1 %. Errors in newton; by size
 of the force: crossed bars.
+
+*Through the daemon's pipeline*: fingers of [shear.toml](../../config/shear.toml), neither tared nor
+calibrated, with drawn parts, sheets and mounts, of which only spreads are stated. Touches of 0.2 to 12 N
+anywhere on a pad, pulled by up to 0.6 of that, follow each other as in [worlds](worlds.md), 16 of them before
+those that are scored. *Published*: vectors with a covariance, whatever the status; the tangential part is
+scored along the pad's axes as stated. Intervals of coverage are of touches; those of a finger share its pads.
 """
 
 from __future__ import annotations
@@ -14,12 +20,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.hand_touches import TouchReadings, draw_touches, estimates
 from benchmarks.page import Report, Row, options, progress
-from benchmarks.scores import Estimates, EstimateScore, bin_labels, concatenate, slices
+from benchmarks.scores import Estimates, EstimateScore, Share, bin_labels, concatenate, slices
+from handtouch import wire
+from handtouch.config import Deployment, load, shipped
 from handtouch.config.shear import Shear
+from handtouch.core.pad_model import PadModel
 from handtouch.field.elastic_layer import calibrate_layer
 from handtouch.field.shear import ShearPad
+from handtouch.hand import mount_transform
+from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
+from handtouch.simulate.truth import GroundTruth
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +60,9 @@ CREEP_STD = 0.01
 """Displacement by creep after 2 s, as of references, against that after 0.1 to 3 s."""
 REFERENCES_N = 2.0 * np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]])
 EARLIER_LOADS = 3
+PULL, WARM_UP = 0.6, 16
+"""Greatest tangential over normal force; touches before those that are scored, until sheets and rest are
+known."""
 
 
 def shear_table(pattern: str) -> Shear:
@@ -176,11 +193,79 @@ def world_rows(touches: int) -> tuple[list[Row], list[Row]]:
     return rows, by_force
 
 
+def stated_deployment(drawn: DrawnWorld) -> Deployment:
+    """Return fingers above shear pads as their builder describes them, with the spread of mounts."""
+    mounts = drawn.world.mounts
+    stated = {"mount_std_mm": mounts.position_mm.std, "mount_std_deg": mounts.orientation_deg.std}
+    deployment = drawn.describe(load(shipped.path("shear.toml")))
+    hands = tuple(hand.model_copy(update=stated) for hand in deployment.hands)
+    return deployment.model_copy(update={"hands": hands})
+
+
+def tangential_error(
+    contact: wire.Contact | None, truth: GroundTruth, rotation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return error (2,) [N] and covariance (2, 2) along a pad's axes; NaN without a vector."""
+    if contact is None or contact.force_vector_n is None or contact.force_vector_covariance_n2 is None:
+        return np.full(2, np.nan), np.full((2, 2), np.nan)
+    assert truth.force_vector_n is not None
+    axes = rotation[:, :2].T
+    covariance = np.reshape(contact.force_vector_covariance_n2, (3, 3))
+    return axes @ np.subtract(contact.force_vector_n, truth.force_vector_n), axes @ covariance @ axes.T
+
+
+def served_forces(world: str, number: int, touches: int) -> Estimates:
+    """Return errors of tangential forces of a drawn finger's touches, through the daemon's pipeline."""
+    drawn = WORLDS[world].draw(Family.REPORTING.seed(number))
+    deployment = stated_deployment(drawn)
+    model, rng = PadModel(deployment), np.random.default_rng((drawn.seed, 7))
+    pulled = []
+    for touch in draw_touches(model.links, WARM_UP + touches, drawn.seed):
+        size = rng.uniform(0.0, PULL) * touch.force_n[0]
+        angle = rng.uniform(0.0, 2 * np.pi)
+        force = float(size * np.cos(angle)), float(size * np.sin(angle))
+        pulled.append(touch.model_copy(update={"tangential_n": (force,)}))
+    hand = VirtualHand(deployment, Scenario(touch=tuple(pulled)), drawn)
+    readings = TouchReadings.of_hand(hand, deployment, range(WARM_UP, WARM_UP + touches))
+    contacts = readings.contacts(model, deployment)
+    pads = {entry.pad.link: entry.pad for entry in deployment.pads}
+    truths = list(readings.truths.items())
+    errors = [
+        tangential_error(contacts.get(key), truth, mount_transform(pads[key[1]])[0]) for key, truth in truths
+    ]
+    forces = np.array([truth.force_n for _, truth in truths])
+    found = [contacts[key].force_vector_status if key in contacts else "" for key, _ in truths]
+    columns = {
+        "pattern": np.array([pads[key[1]].shear for key, _ in truths]),
+        "normal force": bin_labels(forces, (1.0, 2.5), "N"),
+        "status": np.array(found),
+    }
+    unknown = np.full(len(truths), np.nan)
+    return estimates(errors, unknown, np.full((len(truths), 2, 2), np.nan), columns)
+
+
+def served_rows(fingers: int, touches: int) -> list[Row]:
+    """Scores through the pipeline by world and pattern, and by normal force."""
+    rows: list[Row] = []
+    for world in ("default", "harsh"):
+        every = concatenate([served_forces(world, number, touches) for number in range(fingers)])
+        for head in ("pattern", "normal force"):
+            for label, some in slices(every, head):
+                score = EstimateScore.of_estimates(some).row(bounds=False)
+                share = {"published, %": score.pop("valid, %")}
+                status = {"`valid`, %": Share.of_mask(some.columns["status"] == "valid")}
+                rows.append({"world": world, "touches of": label, **score, **share, **status})
+        progress(f"pipeline, {world}")
+    return rows
+
+
 def main() -> None:
     quick = options(__doc__).parse_args().quick
     touches = 20 if quick else 400  # drawn pads of each row
     report = Report(quick, touches_of_a_row=touches)
     worlds, by_force = world_rows(touches)
+    fingers, of_pad = (1, 3) if quick else (16, 12)
+    report.table("Through the daemon's pipeline", served_rows(fingers, of_pad))
     report.table("By world and pattern", worlds)
     report.table("By size of the force", by_force)
     report.keep()

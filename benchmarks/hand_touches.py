@@ -20,6 +20,7 @@ from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import ChannelField
+from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -74,19 +75,25 @@ def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioT
 def serve(
     model: PadModel, deployment: Deployment, counts: NDArray[np.int64], sampled: Mapping[int, int]
 ) -> dict[tuple[int, str], wire.Contact]:
-    """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, c)."""
+    """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, c).
+
+    Those of a pad's shear pad follow its own.
+    """
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     collector = Collector()
     pipeline = pipeline_of(deployment, collector, model=model)
-    for pad, electrodes in enumerate(model.electrodes):
-        layout = tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(len(electrodes)))
+    channels = [len(electrodes) for electrodes in model.electrodes]
+    for shear in model.shear_pads:
+        channels[shear.pad] = shear.column + SHEAR_CHANNELS
+    for pad, own in enumerate(channels):
+        layout = tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(own))
         pipeline.slab.set_layout(pad, layout)
     for tick, rows in enumerate(counts.astype("<i2")):
         t_ns = _FIRST_NS + tick * period_ns
         collector.sampled = sampled.get(tick)
         pipeline.begin_cycle(t_ns, t_ns)
         for pad, row in enumerate(rows):
-            for number in range(-(-len(model.electrodes[pad]) // 4)):
+            for number in range(-(-channels[pad] // 4)):
                 data = row[4 * number : 4 * number + 4].tobytes().ljust(8, b"\0")
                 pipeline.slab.write_pdo(pad, data, t_ns + 1, number)
         pipeline.tick_if_due(t_ns + period_ns)
@@ -115,19 +122,23 @@ class TouchReadings:
     def of_hand(cls, hand: VirtualHand, deployment: Deployment, numbers: range) -> TouchReadings:
         """Return all touches up to the last of these numbers, `STEP_S` apart; these numbers are sampled."""
         period_s = deployment.daemon.sync_period_ms * 1e-3
-        times_s = period_s * np.arange(round((REST_S + numbers.stop * STEP_S) / period_s))
+        ticks = round((REST_S + numbers.stop * STEP_S) / period_s)
+        times_s = np.asarray(period_s * np.arange(ticks), np.float64)
         pads = [entry.pad for entry in deployment.pads]
-        most = max(len(pad.electrode_names) for pad in pads)
-        counts = np.zeros((len(times_s), len(pads), most), np.int64)
-        for row, pad in enumerate(pads):
-            counts[:, row, : len(pad.electrode_names)] = hand.counts(row, times_s)
-        ticks = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
+        made = [hand.counts(row, times_s) for row in range(len(pads))]
+        for row, virtual in enumerate(hand.virtual_pads):
+            if virtual.shear:
+                made[row] = np.hstack([made[row], virtual.shear.counts(times_s)])
+        counts = np.zeros((len(times_s), len(pads), max(own.shape[1] for own in made)), np.int64)
+        for row, own in enumerate(made):
+            counts[:, row, : own.shape[1]] = own
+        at = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
         truths = {
             (k, truth.link): truth
-            for tick, k in ticks.items()
+            for tick, k in at.items()
             for truth in reversed(hand.truth(float(times_s[tick])))  # the first touch of those at once
         }
-        return cls(counts, ticks, truths)
+        return cls(counts, at, truths)
 
     def contacts(self, model: PadModel, deployment: Deployment) -> dict[Key, wire.Contact]:
         """Return the contacts at the samples, through the daemon's pipeline."""

@@ -141,7 +141,7 @@ export interface Contact extends Envelope {
   force_vector_status?: ForceStatus;
   /** force of the object on the pad, in the link's frame: tangential by the shear pad, normal `force_n` */
   force_vector_n?: number[] | null;
-  /** its covariance, row by row; nil where the status is `lower_bound` */
+  /** its covariance, row by row, with that of the mount's angle; nil where the status is `lower_bound` */
   force_vector_covariance_n2?: number[] | null;
   /** the force in the palm's frame; nil unless `palm_status` is `valid` */
   palm_force_vector_n?: number[] | null;

@@ -13,6 +13,7 @@ from handtouch.config import Deployment, Shear, parse
 from handtouch.core.contact_solver import VALUE_SLICES
 from handtouch.core.shear import ShearForces, shear_parameters
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.core.stages.solve import MOUNT_COUNT
 from handtouch.core.state import TickState
 from handtouch.field.shear import ShearPad
 from handtouch.hand import mount_transform
@@ -76,7 +77,8 @@ class ShearBench:
         self.position_status = np.full(self.pads, PositionStatus.VALID, np.uint8)
         self.force_status = np.full(self.pads, ForceStatus.VALID, np.uint8)
         pads = shear_parameters(self.deployment, 4, np.full(self.pads, NOISE_COUNTS))
-        self.forces = ShearForces(pads, self.state, self.position_status, self.force_status)
+        self.mounts = np.zeros((self.pads, MOUNT_COUNT))
+        self.forces = ShearForces(pads, self.state, self.position_status, self.force_status, self.mounts)
         self.state.unverified[:] = False
         self.state.pad_state[:] = PadState.CLEAR
 

@@ -7,6 +7,7 @@ import pytest
 
 from handtouch.core.stages.shear import REST_SAMPLES
 from handtouch.hand import mount_transform
+from handtouch.hand.pads import rotation_from_rpy
 from handtouch.wire import ForceStatus, PositionStatus
 from tests.core.shear_bench import CENTRE_STD_M, FORCE_STD_N, NOISE_COUNTS, PATTERNS, ShearBench
 
@@ -73,6 +74,19 @@ def test_on_a_curved_pad_the_tangential_force_lies_in_the_tangent_plane_of_the_c
     covariance = rotation.T @ bench.state.force_vector[0, 3:].reshape(3, 3) @ rotation
     normal = turn[:, 2]
     assert normal @ covariance @ normal == pytest.approx(FORCE_STD_N**2)
+
+
+def test_the_covariance_includes_the_angle_of_the_mount(bench: ShearBench) -> None:
+    std_rad, rng = np.radians(2.0), np.random.default_rng(5)
+    counts, covariances = bench.counts(0, (0.15e-3, 0.1e-3), 3.0), []
+    for variance in (0.0, std_rad**2):
+        bench.mounts[0, 4] = variance
+        bench.touch(0, 3.0, (0.0, 0.0), counts)
+        bench.tick()
+        covariances.append(bench.state.force_vector[0, 3:].reshape(3, 3).copy())
+    turns = [rotation_from_rpy(rng.normal(0.0, std_rad, 3)) for _ in range(20_000)]
+    turned = np.cov(np.array(turns) @ bench.state.force_vector[0, :3], rowvar=False)
+    np.testing.assert_allclose(covariances[1] - covariances[0], turned, atol=0.05 * turned.max())
 
 
 def test_where_the_normal_is_along_the_pads_x_there_is_no_vector(bench: ShearBench) -> None:

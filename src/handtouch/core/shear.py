@@ -49,7 +49,8 @@ class ShearParameters(NamedTuple):
 class ShearForces:
     """Force vectors of n pads, in a tick's state: those of contacts above shear pads, 0 to n of them.
 
-    position_status, force_status: (n,) of the contacts, read in place.
+    position_status, force_status: (n,) of the contacts, read in place. mounts: (n, MOUNT_COUNT), as
+    `PadModel.mounts`.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class ShearForces:
         state: TickState,
         position_status: NDArray[np.uint8],
         force_status: NDArray[np.uint8],
+        mounts: FloatArray,
     ) -> None:
         self._numbers = {shear.pad: number for number, shear in enumerate(pads)}
         self.any_configured = bool(pads)
@@ -65,7 +67,8 @@ class ShearForces:
         self._state = state
         self._stage = ShearStage(
             *([shear.table() for shear in pads], state.pads, state.memory),
-            *(view_memory(position_status), view_memory(force_status), view_memory(np.zeros(_WORK))),
+            *(view_memory(position_status), view_memory(force_status)),
+            *(view_memory(mounts), view_memory(np.zeros(_WORK))),
         )
 
     def has_shear(self, pad: int) -> bool:

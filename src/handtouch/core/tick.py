@@ -292,7 +292,8 @@ class TickProcessor:
                 "force_status": view_memory(columns.force_status),
             },
         )
-        self.shear = ShearForces(model.shear_pads, self.state, columns.position_status, columns.force_status)
+        statuses = columns.position_status, columns.force_status
+        self.shear = ShearForces(model.shear_pads, self.state, *statuses, model.mounts)
         """force vectors of contacts above shear pads"""
 
     def detect_slips(self, result: TickResult) -> None:

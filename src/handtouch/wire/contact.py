@@ -196,7 +196,7 @@ class Contact:
     force_vector_covariance_n2: Annotated[
         Matrix3 | None, HandColumn("its covariance, row by row; NaN where the status is LOWER_BOUND")
     ] = None
-    """its covariance, row by row; nil where the status is `lower_bound`"""
+    """its covariance, row by row, with that of the mount's angle; nil where the status is `lower_bound`"""
     palm_force_vector_n: Annotated[Vector3 | None, HandColumn("the force in the palm's frame")] = None
     """the force in the palm's frame; nil unless `palm_status` is `valid`"""
     base_force_vector_n: Annotated[Vector3 | None, HandColumn("the force in the base's frame")] = None

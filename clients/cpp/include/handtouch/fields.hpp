@@ -120,7 +120,7 @@ struct Contact {
     std::string force_vector_status = "not_computed";
     // force of the object on the pad, in the link's frame: tangential by the shear pad, normal `force_n`
     std::optional<Vector<3>> force_vector_n;
-    // its covariance, row by row; nil where the status is `lower_bound`
+    // its covariance, row by row, with that of the mount's angle; nil where the status is `lower_bound`
     std::optional<Vector<9>> force_vector_covariance_n2;
     // the force in the palm's frame; nil unless `palm_status` is `valid`
     std::optional<Vector<3>> palm_force_vector_n;

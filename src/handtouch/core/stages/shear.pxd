@@ -5,6 +5,7 @@ from handtouch.core.stages.receive cimport SampleMemory
 cdef Py_ssize_t _CHANNELS, _UNKNOWNS, _POINT, _FILM, _OVERLAP, _LOST, _RADIUS, _INSET, _TRAVEL, _NOISE, _LOAD
 cdef Py_ssize_t _STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE, _LOG_GAIN, _LEAN
 cdef Py_ssize_t _ALONG, _ALPHA, _NUMBERS, _NORMAL, _VALUES, _PAD_M, _FORCE, _FORCE_STD, _COVARIANCE, _VECTOR, _CLEAR
+cdef Py_ssize_t _MOUNT_COUNT, _MOUNT_TURNING
 cdef Py_ssize_t _NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID
 cdef Py_ssize_t _POSITION_UNRELIABLE, _POSITION_INVALID, _REST_SAMPLES, _MAX_STEPS, _MAX_AGM_STEPS
 cdef double _STEP_TOLERANCE, _AGM_TOLERANCE, _MAX_MISFIT, _MAX_EXPONENT, _PI, _ROOT_HALF, _NAN, _INFINITY
@@ -21,7 +22,7 @@ cdef class ShearStage:
     cdef unsigned char[::1] position_requested, force_requested, status
     cdef long long[::1] ticks, update_interval_ticks, sample_ns, read_ns, rest_samples
     cdef unsigned int[::1] contact_id
-    cdef double[::1] values, rest_m, rest_sum, peak_n, vector
+    cdef double[::1] values, rest_m, rest_sum, peak_n, vector, mounts
     cdef double[::1] counts, logs, off, log_area, slope, gain, motion, way, axes
     cdef double misfit
     @cython.locals(number=Py_ssize_t, pad=Py_ssize_t, table=ShearTable)
@@ -43,7 +44,8 @@ cdef void _measure_rest(ShearStage stage, SampleMemory memory, ShearTable table)
                due=bint, position=Py_ssize_t, force=Py_ssize_t)
 cdef void _update_force(ShearStage stage, SampleMemory memory, ShearTable table) noexcept
 @cython.locals(pad=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, at=Py_ssize_t,
-               axis=Py_ssize_t, numbers='double[::1]', gain='double[::1]', axes='double[::1]', known=double,
+               axis=Py_ssize_t, numbers='double[::1]', gain='double[::1]', axes='double[::1]', vector='double[::1]',
+               known=double, turning=double, any_way=double, turned=double,
                xx=double, xy=double, yy=double, by_x=double, by_y=double)
 cdef void _write_vector(
     ShearStage stage, ShearTable table, double fx, double fy, double normal_n) noexcept

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from handtouch.core.stages.receive import SampleMemory
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import MOUNT_COUNT, VALUE_COUNT, VALUE_SLICES
 from handtouch.wire.status import ForceStatus, PadState, PositionStatus
 
 _CHANNELS, _UNKNOWNS, _POINT = 4, 3, 6
@@ -45,6 +45,7 @@ SHEAR_NUMBERS = {
 _VALUES, _PAD_M, _FORCE = VALUE_COUNT, VALUE_SLICES["pad_m"].start, VALUE_SLICES["force_n"].start
 _FORCE_STD, _COVARIANCE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["covariance_m2"].start
 _NORMAL = VALUE_SLICES["normal"].start
+_MOUNT_COUNT, _MOUNT_TURNING = MOUNT_COUNT, 4  # variance of the mount's rotation about each axis [rad^2]
 _VECTOR = 12  # force and its covariance
 _CLEAR = int(PadState.CLEAR)
 _NOT_COMPUTED, _VALID, _LOWER_BOUND, _UNRELIABLE, _INVALID = map(int, ForceStatus)
@@ -80,7 +81,8 @@ class ShearTable:
 class ShearStage:
     """Shear pads of a model. arrays: flat memory of the arrays of `TickState` by their names.
 
-    position_status, force_status: (n,) of the pads' contacts. work: (55,), working memory.
+    position_status, force_status: (n,) of the pads' contacts. mounts: (n MOUNT_COUNT,) as of the
+    `ContactSolver`. work: (55,), working memory.
     """
 
     def __init__(
@@ -90,9 +92,10 @@ class ShearStage:
         arrays: Mapping[str, Any],
         position_status: memoryview[int],
         force_status: memoryview[int],
+        mounts: memoryview[float],
         work: memoryview[float],
     ) -> None:
-        self.tables, self.pads = tables, pads
+        self.tables, self.pads, self.mounts = tables, pads, mounts
         self.position_status, self.force_status = position_status, force_status
         self.ticks, self.update_interval_ticks = arrays["ticks"], arrays["update_interval_ticks"]
         self.pad_state, self.sample_ns = arrays["pad_state"], arrays["sample_ns"]
@@ -270,14 +273,19 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
     xx = kx * kx * xx + (common + axis_variance) * fx * fx + even
     xy = kx * ky * xy + common * fx * fy
     yy = ky * ky * yy + (common + axis_variance) * fy * fy + even
-    axes = stage.axes
+    axes, vector = stage.axes, stage.vector
+    for i in range(3):
+        vector[first + i] = axes[3 * i] * fx + axes[3 * i + 1] * fy - axes[3 * i + 2] * normal_n
+    # a rotation error of s about each axis turns a force F by s^2 (F.F 1 - F F')
+    turning = stage.mounts[pad * _MOUNT_COUNT + _MOUNT_TURNING]
+    any_way = turning * (fx * fx + fy * fy + normal_n * normal_n)
     for i in range(3):
         a, b, c = axes[3 * i], axes[3 * i + 1], axes[3 * i + 2]
-        stage.vector[first + i] = a * fx + b * fy - c * normal_n
         for j in range(3):
             known = (a * xx + b * xy) * axes[3 * j] + (a * xy + b * yy) * axes[3 * j + 1]
-            value = known + c * zz * axes[3 * j + 2]
-            stage.vector[first + 3 + 3 * i + j] = value if zz < _INFINITY else _NAN
+            turned = (any_way if i == j else 0.0) - turning * vector[first + i] * vector[first + j]
+            value = known + c * zz * axes[3 * j + 2] + turned
+            vector[first + 3 + 3 * i + j] = value if zz < _INFINITY else _NAN
 
 
 def _set_axes(stage: ShearStage, table: ShearTable) -> bool:
