@@ -1,6 +1,6 @@
 """Classification of an object's shape: fits of all classes, compared by their evidence.
 
-Public names: `classify_shape`, `classify_shape_stepwise` (the same as a generator), `compare_fits`,
+Public names: `classify_shape`, `classify_touches` (the same as a generator), `compare_fits`,
 `ShapeClassification`.
 """
 
@@ -11,12 +11,13 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from handtouch.percept.primitives import (
     SHAPE_CLASSES,
     PrimitiveFit,
     ShapePrior,
+    Touches,
     fit_primitive,
     run_to_completion,
 )
@@ -50,44 +51,48 @@ def classify_shape(
     covariances_m2: FloatArray,
     prior: ShapePrior | None = None,
     classes: Iterable[str] = SHAPE_CLASSES,
+    *,
+    pads: ArrayLike | None = None,
+    moves: bool = False,
 ) -> ShapeClassification:
     """Classify contact points (n, 3) with normals (n, 3), outward from the pads, and covariances (n, 3, 3).
 
-    All in one frame in which the object is at rest. Every row should be a separate touch: a contact that
-    doesn't move adds the same information only once. Raises ValueError for shapes that don't match, or for
-    values that aren't finite.
+    All in one frame in which the object is at rest, or moves slightly between touches (`moves`). Every row
+    should be a separate touch: a contact that doesn't move adds the same information only once. pads: (n,),
+    numbers of the pads that touched, whose errors are common to their touches; default: all differ. Raises
+    ValueError for shapes that don't match, or for values that aren't finite.
     """
-    return run_to_completion(classify_shape_stepwise(points_m, normals, covariances_m2, prior, classes))
+    n = len(points_m)
+    _check_contacts(points_m, normals, covariances_m2)
+    of_pads = np.arange(n) if pads is None else np.asarray(pads, np.intp)
+    touches = Touches(points_m, normals, covariances_m2, of_pads, np.zeros(n))
+    return run_to_completion(classify_touches(touches, prior or ShapePrior(), classes, moves=moves))
 
 
-def classify_shape_stepwise(
-    points_m: FloatArray,
-    normals: FloatArray,
-    covariances_m2: FloatArray,
-    prior: ShapePrior | None = None,
-    classes: Iterable[str] = SHAPE_CLASSES,
-    moved: bool = False,
+def classify_touches(
+    touches: Touches, prior: ShapePrior, classes: Iterable[str] = SHAPE_CLASSES, *, moves: bool = False
 ) -> Generator[None, None, ShapeClassification]:
     """Classify as `classify_shape`, yielding between small steps so that a caller can bound its time.
 
-    If no class fits an object at rest, an object that moves slightly between touches is tried; sizes are then
-    less certain, and the result says so. moved: motion is known, and only this model is fitted. With few
-    touches the moving model fits anything, so it isn't tried.
+    moves: the object was seen to move. If no class fits one at rest, one that moves slightly between touches
+    is fitted; sizes are then less certain, and the result says so. With few touches that fits anything, so it
+    isn't tried.
     """
-    prior = ShapePrior() if prior is None else prior
-    _check_contacts(points_m, normals, covariances_m2)
-    enough, result = len(points_m) >= _MIN_CONTACTS_MOVING_OBJECT, None
-    for moves in (True,) if moved and enough else (False, True) if enough else (False,):
-        one, fits = prior.for_moving_object() if moves else prior, dict[str, PrimitiveFit]()
-        for name in classes:
-            fits[name] = yield from fit_primitive(name, points_m, normals, covariances_m2, one)
-        found = replace(compare_fits(fits, len(points_m), one), object_moves=moves)
-        if result is None or found.state != "invalid":
-            result = found
-        if result.state != "invalid":
-            break
-    assert result is not None
-    return result
+    contacts = len(touches.points_m)
+    rests = yield from _classify(touches, prior, classes)
+    if rests.state != "invalid" or not moves or contacts < _MIN_CONTACTS_MOVING_OBJECT:
+        return rests
+    moving = yield from _classify(touches, prior.for_moving_object(), classes)
+    return rests if moving.state == "invalid" else replace(moving, object_moves=True)
+
+
+def _classify(
+    touches: Touches, prior: ShapePrior, classes: Iterable[str]
+) -> Generator[None, None, ShapeClassification]:
+    fits: dict[str, PrimitiveFit] = {}
+    for name in classes:
+        fits[name] = yield from fit_primitive(name, touches, prior)
+    return compare_fits(fits, len(touches.points_m), prior)
 
 
 def compare_fits(fits: dict[str, PrimitiveFit], contacts: int, prior: ShapePrior) -> ShapeClassification:

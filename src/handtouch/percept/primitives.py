@@ -6,7 +6,7 @@ MacKay, Information Theory, 2003, ch. 27), which penalises every parameter. The 
 The positions of touches along a surface are taken as given: touches in a row alone are no evidence of an
 edge, only normals that turn about the row are.
 
-Public names: `fit_primitive`, a generator, `run_to_completion`, `PrimitiveFit`, `ShapePrior`,
+Public names: `fit_primitive`, a generator, `run_to_completion`, `PrimitiveFit`, `ShapePrior`, `Touches`,
 `SHAPE_CLASSES`, `SIZE_PARAMETERS`.
 """
 
@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
-# Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they
-# yield.
+# Constants without an origin beside them were chosen; docs/benchmarks/shape.md measures what they yield.
 SHAPE_CLASSES = ("flat", "edge", "cylinder", "sphere")
 SIZE_PARAMETERS = {"flat": (), "edge": (), "cylinder": ("radius",), "sphere": ("radius",)}
 
@@ -43,7 +42,8 @@ class ShapePrior:
     radius_log_std: median radius, and deviation of the logarithm of a radius's excess over the minimum.
     centre_std_m: distance of a centre or an axis from the contacts' mean (1 sigma). surface_std_m: distance
     of a contact from the surface (skin is compliant), on top of its covariance. normal_std_rad: angle of its
-    normal to the surface's, per axis. min_probability: probability from which a class counts as known.
+    normal to the surface's, per axis; pad_turn_std_rad: of that, the same in all touches of a pad, by its
+    mount and joints. min_probability: probability from which a class counts as known.
     moving_surface_std_m, moving_normal_std_rad: both deviations for an object that is handled and doesn't
     rest between touches; see `for_moving_object`.
     """
@@ -55,6 +55,7 @@ class ShapePrior:
     centre_std_m: float = 0.1
     surface_std_m: float = 0.5e-3
     normal_std_rad: float = 0.1
+    pad_turn_std_rad: float = 0.02
     min_probability: float = 0.9
     moving_surface_std_m: float = 2e-3
     moving_normal_std_rad: float = 0.2
@@ -105,15 +106,28 @@ def run_to_completion(steps: Generator[None, None, T]) -> T:
             return found
 
 
-def fit_primitive(
-    name: str, points_m: FloatArray, normals: FloatArray, covariances_m2: FloatArray, prior: ShapePrior
-) -> Generator[None, None, PrimitiveFit]:
-    """Fit one class to contacts, arguments as for `classify_shape`.
+class Touches(NamedTuple):
+    """Contacts (n,) with an object, in one frame: what a shape is fitted to.
+
+    points_m, normals: (n, 3), normals outward from the pads. covariances_m2: (n, 3, 3) of the points, errors
+    of their pad's mount and joints: those of one pad are the same error in all its touches. pads: (n,)
+    numbers. moved_m2: (n,) variance of the object's place along each axis since a touch.
+    """
+
+    points_m: FloatArray
+    normals: FloatArray
+    covariances_m2: FloatArray
+    pads: NDArray[np.intp]
+    moved_m2: FloatArray
+
+
+def fit_primitive(name: str, touches: Touches, prior: ShapePrior) -> Generator[None, None, PrimitiveFit]:
+    """Fit one class to contacts.
 
     Yields between small steps, so that a caller can bound its time.
     """
-    middle = points_m.mean(axis=0)
-    task = _PrimitiveProblem(name, points_m - middle, -normals, covariances_m2, prior)
+    middle = touches.points_m.mean(axis=0)
+    task = _PrimitiveProblem(name, touches.points_m - middle, -touches.normals, touches, prior)
     found = []
     for start in task.starts():
         yield
@@ -140,8 +154,33 @@ class _AxisFrame:
         return np.asarray(found / np.sqrt((found * found).sum(axis=1, keepdims=True)))
 
 
-Residuals = tuple[FloatArray, FloatArray]
-"""Residuals r (b, n, 3) and their variances (b, n, 3)."""
+class _SharedErrors:
+    """Covariance K of residuals (n, 3) with errors of each touch, and errors shared by the touches of a pad.
+
+    independent: (n, 3) variances. shared: (n, 3, k), derivatives by k standard normal errors of the pad; pad:
+    (n,) numbers of the pads, from 0.
+    """
+
+    def __init__(self, independent: FloatArray, shared: FloatArray, pad: NDArray[np.intp]) -> None:
+        self._weight, self._pad = 1 / independent, pad
+        self._weighted = shared * self._weight[:, :, None]
+        self._sums = np.asarray(pad == np.arange(pad.max() + 1)[:, None], np.float64)
+        inner = np.eye(shared.shape[2]) + self._by_pad(shared.swapaxes(1, 2) @ self._weighted)
+        self._inverse = np.linalg.inv(inner)
+        self.log_det = float(np.log(independent).sum() + np.linalg.slogdet(inner)[1].sum())
+
+    def solve(self, r: FloatArray) -> FloatArray:
+        """Return K^-1 r of residuals (b, n, 3), by the formula of Sherman, Morrison and Woodbury."""
+        common = self._inverse @ self._by_pad(self._weighted.swapaxes(1, 2) @ r.transpose(1, 2, 0))
+        return np.asarray(r * self._weight - (self._weighted @ common[self._pad]).transpose(2, 0, 1))
+
+    def _by_pad(self, values: FloatArray) -> FloatArray:
+        """Return the sums (p, k, m) of values (n, k, m) of the touches of each pad."""
+        return (self._sums @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
+
+
+Residuals = tuple[FloatArray, Callable[[], _SharedErrors]]
+"""Residuals r (b, n, 3), and a function that returns the covariance of the first."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +190,7 @@ class _PrimitiveProblem:
     name: str
     points: FloatArray
     outward: FloatArray
-    covariances: FloatArray
+    touches: Touches
     prior: ShapePrior
 
     @cached_property
@@ -160,10 +199,38 @@ class _PrimitiveProblem:
         return _perpendicular_directions(self.outward)
 
     @cached_property
-    def tangential_variance_m2(self) -> FloatArray:
-        """Variance (n,) of points along one tangent."""
-        along = np.einsum("ni,nij,nj->n", self.outward, self.covariances, self.outward)
-        return np.asarray((np.trace(self.covariances, axis1=1, axis2=2) - along) / 2)
+    def roots(self) -> FloatArray:
+        """Symmetric roots (n, 3, 3) of the touches' covariances."""
+        values, vectors = np.linalg.eigh(self.touches.covariances_m2)
+        return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, np.sqrt(np.maximum(values, 0.0)), vectors))
+
+    @cached_property
+    def pad(self) -> NDArray[np.intp]:
+        """Numbers of the pads of the touches (n,), from 0."""
+        return np.unique(self.touches.pads, return_inverse=True)[1]
+
+    @property
+    def place_variance_m2(self) -> FloatArray:
+        """Variance (n,) of a point along any direction that is the touch's own."""
+        return self.touches.moved_m2 + self.prior.surface_std_m**2
+
+    def errors(self, by_place: FloatArray, by_turn: FloatArray, places: int) -> _SharedErrors:
+        """Return the covariance of residuals by their derivatives (n, 3, 3) by place and rotation of a pad.
+
+        The first `places` of a touch are distances, the others angles of normals.
+        """
+        turned = self.prior.pad_turn_std_rad * by_turn
+        shared = np.concatenate([by_place @ self.roots, turned], axis=2)
+        independent = np.full(by_place.shape[:2], self.prior.normal_std_rad**2)
+        independent += self.touches.moved_m2[:, None] * (by_place * by_place).sum(axis=2)
+        independent[:, :places] = self.place_variance_m2[:, None]
+        return _SharedErrors(independent, shared, self.pad)
+
+    def log_tangential_variance(self) -> float:
+        """Return ln of the determinant of the covariance of all points along one tangent."""
+        across = np.eye(3) - self.outward[:, :, None] * self.outward[:, None]
+        shared = (across @ self.roots).reshape(len(across), 1, 9) / math.sqrt(2)
+        return _SharedErrors(self.place_variance_m2[:, None], shared, self.pad).log_det
 
     def starts(self) -> list[tuple[_AxisFrame, FloatArray]]:
         """Return start values, from the normals and from the distribution of the points."""
@@ -217,12 +284,14 @@ class _PrimitiveProblem:
         """Return the residuals for parameters (b, d), which rotate and move `frame`."""
         return _RESIDUALS[self.name](self, frame, theta)
 
-    def cost(self, frame: _AxisFrame, theta: FloatArray) -> tuple[FloatArray, Residuals]:
-        """Return -2 ln (likelihood x prior) (b,) up to a constant, and the residuals."""
-        r, variance = self.residuals(frame, theta)
-        off = theta - self._prior_mean()
-        total = (r * r / variance + np.log(variance)).sum(axis=(1, 2)) + (off * off) @ self.prior_precision()
-        return np.asarray(total), (r, variance)
+    def cost(self, frame: _AxisFrame, theta: FloatArray) -> tuple[float, FloatArray, _SharedErrors]:
+        """Return -2 ln (likelihood x prior) of the first of parameters (b, d), up to a constant; residuals of
+        all, and the covariance of the first.
+        """
+        r, covariance = self.residuals(frame, theta)
+        errors, off = covariance(), theta[0] - self._prior_mean()
+        total = float((r[:1] * errors.solve(r[:1])).sum()) + errors.log_det
+        return total + float((off * off) @ self.prior_precision()), r, errors
 
     def _prior_mean(self) -> FloatArray:
         centre = np.zeros(len(self.prior_precision()))
@@ -237,24 +306,24 @@ class _PrimitiveProblem:
         frame, theta = start
         d, damping = len(theta), 1e-3
         steps = np.concatenate([np.zeros((1, d)), _DIFFERENCE_STEP * np.eye(d)])
-        cost, (r, variance) = self.cost(frame, theta + steps)
-        best, curvature = float(cost[0]), np.eye(d)
+        best, r, errors = self.cost(frame, theta + steps)
+        curvature = np.eye(d)
         for _ in range(_MAX_ITERATIONS):
             yield
-            weight = 1 / np.sqrt(variance[0])
-            slope = ((r[1:] - r[0]) / _DIFFERENCE_STEP * weight).reshape(d, -1)
-            curvature = slope @ slope.T + np.diag(self.prior_precision())
-            downhill = slope @ (r[0] * weight).ravel() + self.prior_precision() * (theta - self._prior_mean())
+            slope = (r[1:] - r[0]) / _DIFFERENCE_STEP
+            solved = errors.solve(slope).reshape(d, -1)
+            curvature = slope.reshape(d, -1) @ solved.T + np.diag(self.prior_precision())
+            downhill = solved @ r[0].ravel() + self.prior_precision() * (theta - self._prior_mean())
             damped = curvature + damping * np.diag(np.diagonal(curvature))
             new = theta - np.linalg.solve(damped, downhill)
             if SIZE_PARAMETERS[self.name]:
                 new[-1] = min(
                     max(new[-1], math.log(_MIN_START_RADIUS_M) - 2), math.log(_MAX_START_RADIUS_M) + 3
                 )
-            cost, found = self.cost(frame, new + steps)
-            gained = best - float(cost[0])
+            cost, *found = self.cost(frame, new + steps)
+            gained = best - cost
             if gained > 0:
-                theta, best, (r, variance), damping = new, float(cost[0]), found, damping * 0.1
+                theta, best, (r, errors), damping = new, cost, found, damping * 0.1
             else:
                 damping *= 10
             if abs(gained) < _COST_TOLERANCE:
@@ -267,28 +336,27 @@ class _PrimitiveProblem:
         """Return the fit at these parameters with its evidence."""
         frame, theta = at
         n, d = len(self.points), len(theta)
-        r, variance = self.residuals(frame, theta[None])
+        r, covariance = self.residuals(frame, theta[None])
         priors = self.prior_precision()
         log_evidence = -cost / 2 + 0.5 * float(np.log(priors).sum())
         log_evidence -= 0.5 * float(np.linalg.slogdet(curvature)[1])
         if self.name == "edge":  # normals may point anywhere within a right angle
             log_evidence += n * (0.5 * math.log(2 * math.pi) - math.log(math.pi / 2))
         else:  # touches in a row are no evidence: peak density of the position across the row
-            log_evidence -= 0.5 * float(
-                np.log(self.tangential_variance_m2 + self.prior.surface_std_m**2).sum()
-            )
-        covariance = np.linalg.inv(curvature)
+            log_evidence -= 0.5 * self.log_tangential_variance()
+        chi2 = float((r * covariance().solve(r)).sum())
+        posterior = np.linalg.inv(curvature)
         beyond = math.exp(theta[-1]) if SIZE_PARAMETERS[self.name] else 0.0
         direction, point, names = self._direction_and_point(frame, theta)
         return PrimitiveFit(
             log_evidence,
-            float((r * r / variance).sum()),
+            chi2,
             3 * n - d,
             direction,
             middle + point,
             self.prior.min_radius_m + beyond if SIZE_PARAMETERS[self.name] else 0.0,
-            beyond * math.sqrt(covariance[-1, -1]) if SIZE_PARAMETERS[self.name] else 0.0,
-            np.asarray(covariance, np.float64),
+            beyond * math.sqrt(posterior[-1, -1]) if SIZE_PARAMETERS[self.name] else 0.0,
+            np.asarray(posterior, np.float64),
             names,
         )
 
@@ -309,32 +377,38 @@ def _flat_residuals(task: _PrimitiveProblem, frame: _AxisFrame, theta: FloatArra
     normal = frame.rotated(theta[:, :2])
     distance = normal @ task.points.T - theta[:, 2:3]
     surface = np.broadcast_to(normal[:, None], (len(theta), *task.points.shape))
-    return _surface_residuals(task, distance, surface, np.zeros((len(theta), 1)))
+    return _surface_residuals(task, distance, surface, np.zeros((len(task.points), 3, 3)))
 
 
 def _sphere_residuals(task: _PrimitiveProblem, frame: _AxisFrame, theta: FloatArray) -> Residuals:  # noqa: ARG001
     away = task.points - theta[:, None, :3]
     length = np.sqrt((away * away).sum(axis=2)) + 1e-12
     radius = task.prior.min_radius_m + np.exp(theta[:, 3:])
-    return _surface_residuals(task, length - radius, away / length[:, :, None], 1 / radius)
+    normal = away / length[:, :, None]
+    bend = (np.eye(3) - normal[0, :, :, None] * normal[0, :, None]) / radius[0]
+    return _surface_residuals(task, length - radius, normal, bend)
 
 
 def _cylinder_residuals(task: _PrimitiveProblem, frame: _AxisFrame, theta: FloatArray) -> Residuals:
-    away = _offset_from_axis(task, frame, theta)[1]
+    axis, away = _offset_from_axis(task, frame, theta)
     length = np.sqrt((away * away).sum(axis=2)) + 1e-12
     radius = task.prior.min_radius_m + np.exp(theta[:, 4:])
-    return _surface_residuals(task, length - radius, away / length[:, :, None], 1 / radius)
+    normal = away / length[:, :, None]
+    bend = np.eye(3) - np.outer(axis[0], axis[0]) - normal[0, :, :, None] * normal[0, :, None]
+    return _surface_residuals(task, length - radius, normal, bend / radius[0])
 
 
 def _edge_residuals(task: _PrimitiveProblem, frame: _AxisFrame, theta: FloatArray) -> Residuals:
     axis, away = _offset_from_axis(task, frame, theta)
     r = np.stack([away @ frame.first, away @ frame.second, axis @ task.outward.T], axis=2)
-    variance = np.empty_like(r)
-    for column, direction in enumerate((frame.first, frame.second)):
-        variance[:, :, column] = np.einsum("i,nij,j->n", direction, task.covariances, direction)
-    variance[:, :, :2] += task.prior.surface_std_m**2
-    variance[:, :, 2] = task.prior.normal_std_rad**2
-    return r, variance
+
+    def covariance() -> _SharedErrors:
+        by_place, by_turn = np.zeros((2, len(task.points), 3, 3))
+        by_place[:, 0], by_place[:, 1] = frame.first, frame.second
+        by_turn[:, 2] = np.cross(task.outward, axis[0])
+        return task.errors(by_place, by_turn, 2)
+
+    return r, covariance
 
 
 def _offset_from_axis(
@@ -347,21 +421,27 @@ def _offset_from_axis(
 
 
 def _surface_residuals(
-    task: _PrimitiveProblem, distance: FloatArray, normal: FloatArray, curvature: FloatArray
+    task: _PrimitiveProblem, distance: FloatArray, normal: FloatArray, bend: FloatArray
 ) -> Residuals:
-    """Return the distance from a surface, and the difference of its normal from the contact's per tangent."""
-    prior = task.prior
+    """Return the distance from a surface, and the difference of its normal from the contact's per tangent.
+
+    bend: (n, 3, 3) derivatives of the surface's normal by the place, for the first parameters.
+    """
     off = task.outward - normal
     # along two tangents of the contact's own normal, the same for all parameters
     r = np.stack(
         [distance, (off * task.tangents[0]).sum(axis=2), (off * task.tangents[1]).sum(axis=2)], axis=2
     )
-    spread = np.einsum("bni,nij->bnj", normal, task.covariances)
-    along = np.einsum("bnj,bnj->bn", spread, normal)
-    variance = np.empty_like(r)
-    variance[:, :, 0] = along + prior.surface_std_m**2
-    variance[:, :, 1:] = (prior.normal_std_rad**2 + curvature**2 * task.tangential_variance_m2)[:, :, None]
-    return r, variance
+
+    def covariance() -> _SharedErrors:
+        by_place, by_turn = np.zeros((2, len(task.points), 3, 3))
+        by_place[:, 0] = normal[0]
+        for row, tangent in enumerate(task.tangents, 1):
+            by_place[:, row] = -np.einsum("nij,ni->nj", bend, tangent)
+            by_turn[:, row] = np.cross(task.outward, tangent)
+        return task.errors(by_place, by_turn, 1)
+
+    return r, covariance
 
 
 _RESIDUALS: dict[str, Callable[[_PrimitiveProblem, _AxisFrame, FloatArray], Residuals]] = {

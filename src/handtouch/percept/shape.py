@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from handtouch.field import estimate
 from handtouch.field.model import ForwardModel
 from handtouch.percept.action_request import CandidateAction, Question
-from handtouch.percept.classify import ShapeClassification, classify_shape_stepwise
-from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior
+from handtouch.percept.classify import ShapeClassification, classify_touches
+from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior, Touches
 from handtouch.percept.samples import (
     ContactBuffer,
     ContactSamples,
@@ -46,6 +46,7 @@ _OBJECT_DRIFT_M_PER_S, _MAX_OBJECT_DRIFT_M = (
     1.5e-3,
     3e-3,
 )  # assumed motion of the object since a touch: rate and bound
+_MOVED_SIGMA = 3.0  # advance of a contact along its normal that shows an object that moves
 _STEPS_PER_FIT = 2
 _SPOT_PERIOD_NS = 500_000_000
 _SPOT_SAMPLES = 64
@@ -113,6 +114,7 @@ class _TouchedObject:
     points: deque[_TouchedPoint] = field(default_factory=lambda: deque(maxlen=_MAX_POINTS))
     last_touch_ns: int = 0
     has_new_points: bool = False
+    moved: bool = False
     running_fit: Generator[None, None, ShapeClassification] | None = None
     classification: ShapeClassification | None = None
 
@@ -138,6 +140,7 @@ class ShapeEstimator(PerceptEstimator):
         self._objects: dict[int, _TouchedObject] = {}
         self._last_point_m, self._last_normal = np.full((pads, 3), np.inf), np.zeros((pads, 3))
         self._last_contact_id = np.zeros(pads, dtype=np.uint32)
+        self._path_m, self._advance_m = np.zeros(pads), np.zeros(pads)
         self._spot_schedule = FitSchedule(pads, _SPOT_PERIOD_NS)
 
     def process_samples(self, buffer: ContactBuffer, sample: ContactSamples) -> Sequence[PerceptEstimate]:
@@ -154,6 +157,7 @@ class ShapeEstimator(PerceptEstimator):
             touched = self._objects.setdefault(int(buffer.hand_index[pad]), _TouchedObject())
             if now_ns - touched.last_touch_ns > _FORGET_TIME_NS and touched.points:
                 touched = self._objects[int(buffer.hand_index[pad])] = _TouchedObject()
+            touched.moved |= self._object_moved(pad, position[row], normal[row], bool(fresh[row]))
             rows = position[row], normal[row], sample["palm_covariance_m2"][row]
             touched.points.append(_TouchedPoint(pad, now_ns, *(values.copy() for values in rows)))
             touched.has_new_points = True
@@ -211,16 +215,30 @@ class ShapeEstimator(PerceptEstimator):
                 found.append(shape_question(result, hand, here, int(self._last_contact_id[here]), self.prior))
         return found
 
+    def _object_moved(self, pad: int, position_m: FloatArray, normal: FloatArray, fresh: bool) -> bool:
+        """Return True if a contact that goes on has moved along its normal: the object gives way.
+
+        A contact that slides or rolls on an object at rest moves at right angles to its normal, whatever the
+        shape; what it advances is by its way and the errors of normals, and by the skin.
+        """
+        if fresh:
+            self._path_m[pad] = self._advance_m[pad] = 0.0
+            return False
+        step = position_m - self._last_point_m[pad]
+        self._path_m[pad] += math.sqrt(float(step @ step))
+        self._advance_m[pad] += float(step @ (normal + self._last_normal[pad])) / 2
+        std_m = math.hypot(
+            math.sqrt(2) * self.prior.surface_std_m, self.prior.normal_std_rad * float(self._path_m[pad])
+        )
+        return abs(float(self._advance_m[pad])) > _MOVED_SIGMA * std_m
+
     def _classify_object(self, touched: _TouchedObject) -> Generator[None, None, ShapeClassification]:
-        """Classify stepwise; older points get a larger covariance, because objects turn in the hand."""
-        _, times_ns, points, normals, covariances = map(np.array, zip(*touched.points, strict=True))
+        """Classify stepwise; the place of older points is less certain, because objects turn in the hand."""
+        pads, times_ns, points, normals, covariances = map(np.array, zip(*touched.points, strict=True))
         age_s = 1e-9 * (times_ns[-1] - times_ns)
         moved_m = np.minimum(_OBJECT_DRIFT_M_PER_S * age_s, _MAX_OBJECT_DRIFT_M)
-        rows = points, normals, covariances + (moved_m**2)[:, None, None] * np.eye(3)
-        moved = (
-            touched.classification is not None and touched.classification.object_moves
-        )  # once moved, it stays so
-        return (yield from classify_shape_stepwise(*rows, self.prior, moved=moved))
+        touches = Touches(points, normals, covariances, pads, moved_m**2)
+        return (yield from classify_touches(touches, self.prior, moves=touched.moved))
 
     def _classify_spot(self, buffer: ContactBuffer, pad: int, now_ns: int) -> Sequence[PerceptEstimate]:
         residual, std = (buffer.window(pad, name, _SPOT_SAMPLES) for name in ("residual", "residual_std"))
