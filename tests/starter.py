@@ -158,6 +158,18 @@ def _become(asked: Any, output: int) -> None:
     sys.argv = ["handtouch", *arguments]
 
 
+def _solve_sheets() -> None:
+    """Solve the sheets of the shipped hand once for all forks; each `simulate` would take 2 s."""
+    from handtouch import config
+    from handtouch.config import shipped
+    from handtouch.simulate.scenario import Scenario
+    from handtouch.simulate.virtual_hand import VirtualHand
+    from handtouch.simulate.worlds import WORLDS
+
+    hand = config.load(shipped.path("utah_mit.toml"))
+    VirtualHand(hand, Scenario.tour(hand), WORLDS["ideal"].draw(1)).prepare()
+
+
 def _main() -> int:
     import importlib
 
@@ -168,6 +180,7 @@ def _main() -> int:
     for name in LOADED:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
+    _solve_sheets()
     with socket.socket(fileno=int(sys.argv[1])) as requests:
         try:
             _serve(requests)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import shutil
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from handtouch.core.compiled import DISABLE_VARIABLE, Compilation
+from handtouch.core.compiled import DISABLE_VARIABLE, MODULES, Compilation, compiled_file
 
 ROOT = Path(__file__).parents[2]
 STATE = "from handtouch.core.compiled import Compilation; from handtouch.core.stages import solve; \
@@ -136,11 +137,16 @@ def test_only_changed_modules_are_compiled_to_equal_bytes_and_reused_by_other_cl
 
 def test_modules_for_another_machine_are_never_of_this_one(copied: Path) -> None:
     other = "x86_64" if platform.machine() == "aarch64" else "aarch64"
+    built = copied.parent / "build" / other
+    built.mkdir(parents=True)
+    (built / "cython.txt").write_text(importlib.metadata.version("cython"))
+    for stage in set(MODULES) - {"tables"}:  # the smallest is enough
+        (built / compiled_file(stage, f"linux_{other}").name).touch()
     build = f"from pathlib import Path; from handtouch.core.build import build_stages; \
 build_stages(Path({str(copied)!r}), {other!r})"
     failed = run("-c", build, source=copied, CC="cc")  # instead of a cross compiler
     assert f"compiles for another machine than {other}" in failed.stderr
-    assert not list((copied.parent / "build").rglob("*.so"))
+    assert not list(built.glob("tables-*"))
 
 
 def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -> None:
@@ -156,12 +162,14 @@ def test_a_build_without_a_compiler_names_the_package_to_install(copied: Path) -
 
 @needs_compiled
 def test_modules_of_another_version_of_cython_are_never_mixed(copied: Path) -> None:
+    """All are removed before the first is compiled, which here fails."""
     folder = copied / "handtouch/core/stages/_compiled"
-    before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.so")}
     (folder / "cython.txt").write_text("3.2.0")
     next(folder.glob("tables-*")).unlink()
-    done = run("-m", "handtouch.core.build", source=copied, XDG_CACHE_HOME=str(copied.parent / "cache"))
-    assert done.returncode == 0, done.stderr
-    after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.so")}
-    assert after.keys() == before.keys()
-    assert not set(after.values()) & set(before.values())
+    assert list(folder.glob("*.so"))
+    cache = str(copied.parent / "cache")
+    failed = run("-m", "handtouch.core.build", source=copied, PATH="/nowhere", CC="", XDG_CACHE_HOME=cache)
+    assert failed.returncode == 1
+    assert "there is no C compiler" in failed.stderr
+    assert not list(folder.glob("*.so"))
+    assert (folder / "cython.txt").read_text() == importlib.metadata.version("cython")

@@ -159,7 +159,7 @@ class Rig:
             assert time.monotonic() < end_s, (
                 f"never {what}: {json.dumps(status, indent=1)}\n{self.all_printed()}"
             )
-            time.sleep(0.02)
+            time.sleep(0.1)  # each answer costs milliseconds of both
 
     def wait_operational(self, count: int = 15) -> dict[str, Any]:
         return self.wait(

@@ -19,7 +19,7 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -87,12 +87,11 @@ class OutlineSurface(Surface):
     @cached_property
     def outline(self) -> Outline:
         """The drawing."""
-        bulges = [math.tan(turn / 4) for turn in self.turns_rad]
-        return Outline(list(zip(self.outline_x_m, self.outline_y_m, strict=True)), bulges)
+        return _draw(self.outline_x_m, self.outline_y_m, self.turns_rad)
 
     @cached_property
     def _map(self) -> ConformalRectangle:
-        return ConformalRectangle(self.outline, self.corners_m)
+        return _map_outline(self.outline_x_m, self.outline_y_m, self.turns_rad, self.corners_m)
 
     @cached_property
     def _side_lengths(self) -> list[float]:
@@ -278,3 +277,19 @@ class OutlineOnSphere(OutlineSurface):
 
     def _stretch(self, z: ComplexArray) -> FloatArray:
         return np.asarray(1 / (1 + np.abs(z / (2 * self.radius_m)) ** 2))
+
+
+def _draw(x_m: tuple[float, ...], y_m: tuple[float, ...], turns_rad: tuple[float, ...]) -> Outline:
+    bulges = [math.tan(turn / 4) for turn in turns_rad]
+    return Outline(list(zip(x_m, y_m, strict=True)), bulges)
+
+
+@lru_cache(maxsize=64)
+def _map_outline(
+    x_m: tuple[float, ...],
+    y_m: tuple[float, ...],
+    turns_rad: tuple[float, ...],
+    corners_m: tuple[float, ...],
+) -> ConformalRectangle:
+    """Return the map of a drawing; solving takes seconds, and each user of a pad builds its surface anew."""
+    return ConformalRectangle(_draw(x_m, y_m, turns_rad), corners_m)
