@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from handtouch.core.groups import ContactGroups
+from handtouch.core.memory import view_rows
+from handtouch.core.stages.frames import CONTACT_FRAMES
+from handtouch.core.stages.groups import ContactGroups
 from handtouch.core.state import TickState
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -21,7 +23,8 @@ class Contacts:
     def __init__(self, n: int = 4, hand: tuple[int, ...] | None = None) -> None:
         self.state = TickState.empty(n)
         self.state.palm_requested[:] = True
-        self.groups = ContactGroups(np.full(n, 0.02), np.array(hand or [0] * n), self.state)
+        palm = view_rows(self.state.palm_values, CONTACT_FRAMES)["palm"]
+        self.groups = ContactGroups(np.full(n, 0.02), np.array(hand or [0] * n), self.state, palm)
 
 
 def step(
@@ -31,7 +34,7 @@ def step(
     made.state.palm_values[:, :3] = np.stack([[x, 0.0, 0.0] for x in x_m])
     made.state.palm_values[:, 3:6] = np.stack(normals or [UP] * len(ids))
     made.groups.update_groups()
-    return list(map(int, made.groups.group_id))
+    return list(map(int, made.state.group_id))
 
 
 def test_near_contacts_form_a_group() -> None:

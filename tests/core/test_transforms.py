@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
 from handtouch.core.contact_solver import PART_COUNT
+from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.stages.kinematics import LinkPose, LinkPoses
 from handtouch.core.state import TickState
 from handtouch.core.tick import PadColumns, TickResult
-from handtouch.core.transforms import ContactTransforms
 from handtouch.hand.joints import JointSnapshot, JointStateBuffer
 from handtouch.hand.robot_models import RobotModels
 from handtouch.wire import FrameStatus

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 STAGES = (
     *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
-    *("kinematics", "frames", "publish", "groups", "shear", "evidence"),
+    *("kinematics", "groups", "frames", "publish", "shear", "evidence"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 SHARED = "_shared"

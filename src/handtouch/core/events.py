@@ -21,8 +21,8 @@ from pydantic import TypeAdapter
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.sheet_force import ForceReference
+from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.tick import TickProcessor
-from handtouch.core.transforms import ContactTransforms
 
 
 class EventTarget(Protocol):

@@ -16,10 +16,10 @@ from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.events import Event, encode_calibration, encode_event
 from handtouch.core.slab import Cycle, Slab
+from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import MessageSink
-from handtouch.core.transforms import ContactTransforms
 
 _NO_LIMIT_NS = np.iinfo(np.int64).max
 

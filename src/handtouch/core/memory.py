@@ -1,6 +1,7 @@
-"""Memory of arrays as the stages take it: flat memoryviews, which Python reads as its own numbers.
+"""Memory of arrays as the stages take it: flat memoryviews, which Python reads as its own numbers, and rows
+of named numbers.
 
-Public names: `view_memory`, `slices_of`.
+Public names: `view_memory`, `view_rows`, `slices_of`, `row_count`, `RowArray`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+RowArray = np.recarray[tuple[int], np.dtype[np.void]]
+_SIZE = 8
+"""Bytes of a number"""
 
 
 def view_memory(array: NDArray[Any]) -> memoryview[Any]:
@@ -22,10 +27,24 @@ def view_memory(array: NDArray[Any]) -> memoryview[Any]:
     return memory
 
 
-def slices_of(**sizes: int) -> dict[str, slice]:
-    """Return the place of each named value in a row of numbers, in the order given."""
-    places, first = {}, 0
-    for name, size in sizes.items():
-        places[name] = slice(first, first + size)
-        first += size
+def view_rows(array: NDArray[Any], row: np.dtype[np.void]) -> RowArray:
+    """Return the memory of an array as rows (k,) of named numbers."""
+    return array.reshape(-1).view(row).view(np.recarray)
+
+
+def slices_of(row: np.dtype[np.void]) -> dict[str, slice]:
+    """Return the place of each named value in a row of numbers; names in a row of rows are joined by _."""
+    places = {}
+    for name in row.names or ():
+        field, offset = row[name], row.fields[name][1] // _SIZE  # type: ignore[index]
+        if field.names:
+            for inner, at in slices_of(field).items():
+                places[f"{name}_{inner}"] = slice(offset + at.start, offset + at.stop)
+        else:
+            places[name] = slice(offset, offset + row_count(field))
     return places
+
+
+def row_count(row: np.dtype[Any]) -> int:
+    """Return the number of numbers in a row."""
+    return row.itemsize // _SIZE

@@ -19,10 +19,10 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.sheet_force import ForceReference
 from handtouch.core.slab import Cycle, Slab
+from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor, TickResult
 from handtouch.core.tick_messages import MessageSink, TickMessages
-from handtouch.core.transforms import ContactTransforms
 from handtouch.hand.robot_models import RobotModels
 from handtouch.wire import PadState
 

@@ -18,11 +18,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import view_memory
-from handtouch.core.stages.frames import FRAME_VALUES, PART_FRAMES
+from handtouch.core.memory import row_count, view_memory
+from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES
 from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
-from handtouch.core.stages.solve import PARTS_COUNT, VALUE_COUNT
+from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
@@ -45,10 +45,14 @@ class StateLayoutError(ValueError):
 
 
 class Stored:
-    """Type, shape ("pads", "hands", "channels" or a number for each dimension) and first value of a field."""
+    """Type, shape and first value of a field.
 
-    def __init__(self, dtype: str, *shape: int | str, fill: float = 0) -> None:
-        self.dtype, self.shape, self.fill = np.dtype(dtype), shape, fill
+    shape: for each dimension "pads", "hands", "channels", a number, or a row of named numbers.
+    """
+
+    def __init__(self, dtype: str, *shape: int | str | np.dtype[np.void], fill: float = 0) -> None:
+        self.shape = tuple(row_count(size) if isinstance(size, np.dtype) else size for size in shape)
+        self.dtype, self.fill = np.dtype(dtype), fill
 
 
 _PADS, _HANDS, _CHANNELS = "pads", "hands", "channels"
@@ -105,10 +109,10 @@ class TickState:
     peak_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
     solved: Annotated[BoolArray, Stored("?", _PADS)]
     """contacts that were solved since they began and their outputs were requested"""
-    values: Annotated[FloatArray, Stored("<f8", _PADS, VALUE_COUNT, fill=math.nan)]
-    """values of the contact's last solved sample, see `stages.solve.VALUE_SLICES`"""
-    parts: Annotated[FloatArray, Stored("<f8", _PADS, PARTS_COUNT, fill=math.nan)]
-    """of each pad the two contacts of that sample, twice `stages.solve.PART_SLICES`; NaN if there is one"""
+    values: Annotated[FloatArray, Stored("<f8", _PADS, VALUE_ROW, fill=math.nan)]
+    """values of the contact's last solved sample, see `stages.solve.VALUE_ROW`"""
+    parts: Annotated[FloatArray, Stored("<f8", _PADS, np.dtype((PART_ROW, 2)), fill=math.nan)]
+    """of each pad the two contacts of that sample, see `stages.solve.PART_ROW`; NaN if there is one"""
     uncompensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
     uncompensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
 
@@ -204,7 +208,8 @@ class TickState:
     # palm and base frames, see `ContactTransforms` and `ContactGroups`
     palm_status: Annotated[Uint8Array, Stored("u1", _PADS)]
     base_status: Annotated[Uint8Array, Stored("u1", _PADS)]
-    palm_values: Annotated[FloatArray, Stored("<f8", _PADS, 2 * FRAME_VALUES + 1, fill=math.nan)]
+    palm_values: Annotated[FloatArray, Stored("<f8", _PADS, CONTACT_FRAMES, fill=math.nan)]
+    """see `stages.frames.CONTACT_FRAMES`"""
     palm_rotation: Annotated[FloatArray, Stored("<f8", _PADS, 3, 3, fill=math.nan)]
     joint_variance_m2: Annotated[FloatArray, Stored("<f8", _PADS)]
     group_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
@@ -234,8 +239,8 @@ class TickState:
     """ForceStatus"""
     frame_force_vector: Annotated[FloatArray, Stored("<f8", _PADS, 6, fill=math.nan)]
     """force in the palm's frame, then in the base's"""
-    part_frames: Annotated[FloatArray, Stored("<f8", _PADS, PART_FRAMES, fill=math.nan)]
-    """of each of two contacts on a pad, `FRAME_SLICES` in the palm, then in the base"""
+    part_frames: Annotated[FloatArray, Stored("<f8", _PADS, np.dtype((PART_FRAMES, 2)), fill=math.nan)]
+    """of two contacts on a pad, see `stages.frames.PART_FRAMES`"""
 
     # messages
     contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]

@@ -18,15 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import row_count, slices_of, view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
-from handtouch.core.stages.frames import FRAME_SLICES, FRAME_VALUES
+from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES, ContactTransforms
 from handtouch.core.stages.publish import CONDITIONS, FIELD_KINDS, INTEGERS, ContactEncoder
 from handtouch.core.stages.solve import PART_COUNT, PART_SLICES, VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.core.tick import TickProcessor, TickResult
-from handtouch.core.transforms import ContactTransforms
 from handtouch.wire import ContactEvent, EndReason, ForceStatus, FrameStatus, PadState, PositionStatus
 
 END_REASONS: dict[PadState, EndReason] = {
@@ -63,18 +62,13 @@ _PAD_TEXTS = (
     "hand", "link", "frame", "begin_threshold_n", "end_threshold_n", "calibration_id", "diagnoses",
 )  # fmt: skip
 """Fields that change with a pad's calibration only"""
-_FRAME_FIELDS = {
-    frame + name: (frame.rstrip("_"), slice(first + at.start, first + at.stop))
-    for first, frame in ((0, "palm_"), (FRAME_VALUES, "base_"))
-    for name, at in FRAME_SLICES.items()
-}
 _PLACES = {
-    **{name: (frame, "palm_values", at) for name, (frame, at) in _FRAME_FIELDS.items()},
+    **{name: (name[:4], "palm_values", at) for name, at in slices_of(CONTACT_FRAMES).items()},
     **{name: ("located", "values", VALUE_SLICES[name]) for name in ("position_m", "normal", "pad_m")},
     "covariance_m2": ("located", "values", VALUE_SLICES["covariance_m2"]),
     "mount_covariance_m2": ("located", "values", VALUE_SLICES["mount_covariance_m2"]),
     "force_std_n": ("std", "values", VALUE_SLICES["force_std_n"]),
-    "joints_age_s": ("frames", "palm_values", slice(2 * FRAME_VALUES, 2 * FRAME_VALUES + 1)),
+    "joints_age_s": ("frames", "palm_values", slices_of(CONTACT_FRAMES)["joints_age_s"]),
     "uncompensated_force_n": ("modelled", "uncompensated_force_n", slice(0, 1)),
     "force_vector_n": ("vector", "force_vector", slice(0, 3)),
     "force_vector_covariance_n2": ("vector", "force_vector", slice(3, 12)),
@@ -85,11 +79,11 @@ _PLACES = {
 are those of the same name in VALUE_SLICES, or in the state."""
 _PART_PLACES = {
     **{name: ("always", "parts", at) for name, at in PART_SLICES.items()},
-    **{name: (f"part_{frame}", "part_frames", at) for name, (frame, at) in _FRAME_FIELDS.items()},
+    **{name: (f"part_{name[:4]}", "part_frames", at) for name, at in slices_of(PART_FRAMES).items()},
 }
 """The same of the fields of `wire.ContactPart`"""
 _PART_FIELDS = tuple(wire.ContactPart.__annotations__)
-_PART_STEPS = {"parts": PART_COUNT, "part_frames": 2 * FRAME_VALUES}
+_PART_STEPS = {"parts": PART_COUNT, "part_frames": row_count(PART_FRAMES)}
 _MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
 
@@ -117,7 +111,7 @@ class TickMessages:
         transforms: ContactTransforms | None = None,
     ) -> None:
         self._model = model
-        self._transforms = transforms or ContactTransforms(model.hands)
+        self._transforms = transforms or ContactTransforms(model.hands, None, tick.state)
         self._tick = tick
         self._session = session
         self._state = tick.state

@@ -1,32 +1,43 @@
 cimport cython
 from handtouch.core.stages cimport kinematics
+from handtouch.core.stages.rows cimport FrameRow, PartRow, PoseRow, ValueRow
 
-cdef Py_ssize_t _COUNT, _ROW, _AGE, _VALUES, _POSITION, _NORMAL, _COVARIANCE, _VECTOR, _FRAME_VECTORS
-cdef Py_ssize_t _NOT_COMPUTED, _VALID, _STALE, _INVALID
-cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT, _PART_FRAMES, _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE
+cdef Py_ssize_t _BASE, _AGE, _ROW, _PARTS, _VECTOR, _VECTORS, _NOT_COMPUTED, _VALID, _STALE, _INVALID
 cdef double _NAN, _INFINITY
 cdef long long _NEVER_NS
 
 cdef class HandFrames:
+    cdef object name, errors
     cdef kinematics.LinkPoses tree
     cdef Py_ssize_t first, stop
     cdef unsigned char[::1] masks
     cdef double[::1] stds, mounts
     cdef double mount_variance, mount_rotation_variance, stale_s
 
-cdef class FrameStage:
+cdef class ContactTransforms:
+    cdef public object joints_at
+    cdef readonly list used_joints
+    cdef readonly bint any_requested
+    cdef object held, requested, groups, published_values
+    cdef list hands
     cdef Py_ssize_t pads
-    cdef double[::1] values, frame_values, rotation, joint_variance_m2, pose, covariance, vector, frame_vector
-    cdef double[::1] parts, part_frames
+    cdef PoseRow[::1] pose
+    cdef FrameRow[::1] on_link
+    cdef ValueRow[::1] contacts
+    cdef PartRow[::1] parts
+    cdef FrameRow[:] palm, base, parts_palm, parts_base
+    cdef double[::1] values, part_values, rotation, vector, frame_vector, joint_variance_m2, covariance
     cdef float[::1] published
     cdef long long[::1] sample_ns
     cdef unsigned char[::1] palm_requested, base_requested, palm_status, base_status, pending
-    @cython.locals(k=Py_ssize_t, pad=Py_ssize_t)
-    cpdef begin_contacts(self, const Py_ssize_t[::1] began, const Py_ssize_t[::1] updated)
+    @cython.locals(pad=Py_ssize_t)
+    cpdef refresh(self)
+    @cython.locals(pad=Py_ssize_t, hand=HandFrames, sample_ns='long long')
+    cpdef transform_updated(self, result)
+    @cython.locals(k=Py_ssize_t)
+    cpdef begin_contacts(self, const Py_ssize_t[::1] pads)
     @cython.locals(k=Py_ssize_t)
     cpdef discard(self, const Py_ssize_t[::1] pads)
-    @cython.locals(pad=Py_ssize_t)
-    cpdef publish(self)
     @cython.locals(pad=Py_ssize_t, earliest='long long')
     cpdef long long next_sample_ns(self, HandFrames hand)
     @cython.locals(pad=Py_ssize_t, joint=Py_ssize_t)
@@ -34,26 +45,30 @@ cdef class FrameStage:
         self, HandFrames hand, long long sample_ns, const double[::1] positions, const double[::1] ages_s,
         const double[::1] stds)
 
-cdef void _begin_contact(FrameStage stage, Py_ssize_t pad) noexcept
-@cython.locals(i=Py_ssize_t, first=Py_ssize_t, in_palm=double, in_base=double)
-cdef void _discard(FrameStage stage, Py_ssize_t pad) noexcept
-@cython.locals(row=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, first=Py_ssize_t, width=Py_ssize_t,
-               status=Py_ssize_t, value=double)
-cdef void _publish_pad(FrameStage stage, Py_ssize_t pad) noexcept
+cdef void _begin_contact(ContactTransforms frames, Py_ssize_t pad) noexcept
+@cython.locals(i=Py_ssize_t, in_palm=double, in_base=double)
+cdef void _discard(ContactTransforms frames, Py_ssize_t pad) noexcept
+@cython.locals(row=Py_ssize_t, i=Py_ssize_t, in_palm=bint, in_base=bint)
+cdef void _publish_pad(ContactTransforms frames, Py_ssize_t pad) noexcept
 cdef void _transform_contact(
-    FrameStage stage, HandFrames hand, Py_ssize_t pad, const double[::1] ages_s) noexcept
-@cython.locals(link=Py_ssize_t, joints=Py_ssize_t, joint=Py_ssize_t, mask=Py_ssize_t, on_pad=Py_ssize_t,
-               row=Py_ssize_t, at=Py_ssize_t, status=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t,
-               pose='double[::1]', values='double[::1]')
+    ContactTransforms frames, HandFrames hand, Py_ssize_t pad, const double[::1] ages_s) noexcept
+@cython.locals(link=Py_ssize_t, joint=Py_ssize_t, mask=Py_ssize_t, status=Py_ssize_t, i=Py_ssize_t,
+               vector=Py_ssize_t, turned_vector=Py_ssize_t, part=Py_ssize_t)
 cdef double _transform(
-    FrameStage stage, HandFrames hand, Py_ssize_t pad, bint in_base, const double[::1] ages_s) noexcept
-@cython.locals(link=Py_ssize_t, k=Py_ssize_t, i=Py_ssize_t, at=Py_ssize_t)
-cdef void _transform_parts(FrameStage stage, HandFrames hand, Py_ssize_t pad, bint in_base) noexcept
-@cython.locals(i=Py_ssize_t, pose='double[::1]')
+    ContactTransforms frames, HandFrames hand, Py_ssize_t pad, bint in_base, const double[::1] ages_s) noexcept
+@cython.locals(i=Py_ssize_t)
+cdef void _transform_part(
+    ContactTransforms frames, HandFrames hand, Py_ssize_t link, Py_ssize_t part, bint in_base) noexcept
+@cython.locals(element=double)
+cdef double _turning(ContactTransforms frames, Py_ssize_t i, Py_ssize_t j) noexcept
+@cython.locals(i=Py_ssize_t, x=double, y=double, z=double)
+cdef void _set_joint_covariance(
+    ContactTransforms frames, HandFrames hand, Py_ssize_t link, bint in_base) noexcept
+@cython.locals(i=Py_ssize_t)
 cdef void _write_in_frame(
-    FrameStage stage, HandFrames hand, Py_ssize_t link, double[::1] values, Py_ssize_t position,
-    Py_ssize_t normal, Py_ssize_t covariance, double[::1] written, Py_ssize_t row) noexcept
-@cython.locals(at=Py_ssize_t, mount=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, pose='double[::1]')
-cdef void _add_link_covariance(
-    FrameStage stage, HandFrames hand, Py_ssize_t link, double[::1] values, Py_ssize_t position,
-    Py_ssize_t first) noexcept
+    ContactTransforms frames, HandFrames hand, Py_ssize_t link, FrameRow[:] written, Py_ssize_t row) noexcept
+@cython.locals(i=Py_ssize_t, j=Py_ssize_t)
+cdef void _add_link_covariance(ContactTransforms frames, HandFrames hand, Py_ssize_t link) noexcept
+@cython.locals(turned=double)
+cdef double _turned_column(
+    ContactTransforms frames, Py_ssize_t j, double a, double b, double c) noexcept

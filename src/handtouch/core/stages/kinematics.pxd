@@ -2,7 +2,7 @@ cimport cython
 from libc cimport math
 from handtouch.core.stages.rows cimport JointRow, PoseRow
 
-cdef Py_ssize_t _POSE, _TURNS, _SLIDES
+cdef Py_ssize_t _TURNS, _SLIDES
 
 cdef class LinkPoses:
     cdef JointRow[::1] tree
@@ -15,13 +15,12 @@ cdef class LinkPoses:
     cpdef set_joint_positions(self, const double[::1] positions)
     @cython.locals(at=Py_ssize_t, seen_from=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, a=double, b=double,
                    c=double, x=double, y=double, z=double)
-    cpdef write_pose(self, Py_ssize_t link, bint in_base, double[::1] out)
+    cpdef write_pose(self, Py_ssize_t link, bint in_base, PoseRow[::1] out)
     @cython.locals(velocities='double[::1]', at=Py_ssize_t, seen_from=Py_ssize_t, row=Py_ssize_t,
-                   i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, px=double, py=double, pz=double, x=double,
-                   y=double, z=double, turned=double)
+                   i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, x=double, y=double, z=double, turned=double)
     cpdef add_joint_covariance(
-        self, Py_ssize_t link, bint in_base, double[::1] point, Py_ssize_t first,
-        double[::1] stds, double[::1] out)
+        self, Py_ssize_t link, bint in_base, double px, double py, double pz, double[::1] stds,
+        double[::1] out)
 
 @cython.locals(turned=double)
 cdef double _turned(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import RowArray, view_memory, view_rows
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -37,7 +37,6 @@ JOINT_ROW = np.dtype(
 """A joint of the tree"""
 POSE_ROW = np.dtype([("rotation", "<f8", 9), ("translation", "<f8", 3)])
 """Pose of a frame in the root of the tree"""
-_POSE = 12
 _TURNS, _SLIDES = 1, 2
 _KINDS = {"revolute": _TURNS, "continuous": _TURNS, "prismatic": _SLIDES}
 
@@ -67,9 +66,9 @@ class LinkPoses:
             np.array([*hand.link_frames, hand.palm_frame, hand.base_frame], dtype=np.intp)
         )
         self.signs = view_memory(np.stack([hand.palm_signs, hand.base_signs]))
-        poses = np.zeros(self.tree_joints + 1, POSE_ROW)
-        poses["rotation"][0] = np.eye(3).ravel()
-        self.poses = poses.view(np.recarray)
+        poses = view_rows(np.zeros(self.tree_joints + 1, POSE_ROW), POSE_ROW)
+        poses.rotation[0] = np.eye(3).ravel()
+        self.poses = poses
         self.velocities = view_memory(np.zeros(3 * self.joints))
         self.set_joint_positions(view_memory(np.zeros(self.joints)))
 
@@ -91,9 +90,10 @@ class LinkPoses:
     ) -> FloatArray:
         """Return the covariance (3, 3) of a point (3,) of a link from the standard deviations (m,) of the
         joints, in palm or base frame."""
-        covariance, point = np.zeros(9), np.array(position_m, dtype=np.float64)
+        covariance = np.zeros(9)
+        x, y, z = np.asarray(position_m, dtype=np.float64).tolist()
         self.add_joint_covariance(
-            link, in_base, view_memory(point), 0, stds=view_memory(std_rad), out=view_memory(covariance)
+            link, in_base, x, y, z, stds=view_memory(std_rad), out=view_memory(covariance)
         )
         return covariance.reshape(3, 3)
 
@@ -105,8 +105,8 @@ class LinkPoses:
                 moved += self.tree[k].factor * positions[mover]
             _place_child(self, k, moved)
 
-    def write_pose(self, link: int, in_base: bool, out: memoryview[float]) -> None:
-        """Write rotation and translation (12,) of a link in the palm or base frame."""
+    def write_pose(self, link: int, in_base: bool, out: RowArray) -> None:
+        """Write the pose of a link in the palm or base frame to the first POSE_ROW of `out`."""
         at, seen_from = self.frames[link], self.frames[self.links + (1 if in_base else 0)]
         x = self.poses[at].translation[0] - self.poses[seen_from].translation[0]
         y = self.poses[at].translation[1] - self.poses[seen_from].translation[1]
@@ -116,29 +116,29 @@ class LinkPoses:
             b = self.poses[seen_from].rotation[3 + i]
             c = self.poses[seen_from].rotation[6 + i]
             for j in range(3):
-                out[3 * i + j] = (
+                out[0].rotation[3 * i + j] = (
                     a * self.poses[at].rotation[j]
                     + b * self.poses[at].rotation[3 + j]
                     + c * self.poses[at].rotation[6 + j]
                 )
-            out[9 + i] = a * x + b * y + c * z
+            out[0].translation[i] = a * x + b * y + c * z
 
     def add_joint_covariance(
         self,
         link: int,
         in_base: bool,
-        point: memoryview[float],
-        first: int,
+        px: float,
+        py: float,
+        pz: float,
         stds: memoryview[float],
         out: memoryview[float],
     ) -> None:
-        """Add the covariance (9,) of a point on a link that the joints' deviations (m,) cause.
+        """Add the covariance (9,) of a point (px, py, pz) of a link that the joints' deviations (m,) cause.
 
-        point: in the link's frame, from index `first` on. The covariance is in palm or base frame.
+        The covariance is in palm or base frame.
         """
         velocities = self.velocities
         at, seen_from = self.frames[link], self.frames[self.links + (1 if in_base else 0)]
-        px, py, pz = point[first], point[first + 1], point[first + 2]
         x = _turned(self, at, 0, px, py, pz) + self.poses[at].translation[0]
         y = _turned(self, at, 1, px, py, pz) + self.poses[at].translation[1]
         z = _turned(self, at, 2, px, py, pz) + self.poses[at].translation[2]
@@ -159,7 +159,7 @@ class LinkPoses:
                         out[3 * i + j] += velocities[3 * k + i] * velocities[3 * k + j]
 
 
-def _joint_rows(hand: HandKinematics) -> np.recarray[tuple[int], np.dtype[np.void]]:
+def _joint_rows(hand: HandKinematics) -> RowArray:
     rows = np.zeros(len(hand.tree), JOINT_ROW)
     rows["parent"], rows["mover"] = hand.parents, hand.movers
     rows["factor"], rows["offset"] = hand.factors, hand.offsets
@@ -174,9 +174,9 @@ def _joint_rows(hand: HandKinematics) -> np.recarray[tuple[int], np.dtype[np.voi
 
 
 def _pose(poses: LinkPoses, link: int, in_base: bool) -> LinkPose:
-    pose = np.empty(_POSE)
-    poses.write_pose(link, in_base, view_memory(pose))
-    return LinkPose(pose[:9].reshape(3, 3), pose[9:])
+    pose = view_rows(np.zeros(1, POSE_ROW), POSE_ROW)
+    poses.write_pose(link, in_base, pose)
+    return LinkPose(pose.rotation.reshape(3, 3), pose.translation[0])
 
 
 def _turned(tree: LinkPoses, frame: int, i: int, x: float, y: float, z: float) -> float:

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from handtouch.core.memory import row_count
 from handtouch.core.stages.force import BOUNDED, WIDE
-from handtouch.core.stages.frames import FRAME_VALUES
+from handtouch.core.stages.frames import FRAME_ROW, PART_FRAMES
 from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
 from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
 
@@ -28,7 +29,7 @@ _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 _FRAME_VALID = int(FrameStatus.VALID)
 _END = 2  # number of the event
 _HEADER_BYTES, _NUMBER_BYTES, _ROW_COUNT, _VALUE_NUMBERS = 3, 9, 6, 3
-_FRAME_VALUES, _PART_FRAMES = FRAME_VALUES, 2 * FRAME_VALUES
+_FRAME_VALUES, _PART_FRAMES = row_count(FRAME_ROW), row_count(PART_FRAMES)
 _PARTS_COUNT = PARTS_COUNT
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9

@@ -8,27 +8,32 @@ from __future__ import annotations
 
 import math
 
-from handtouch.core.memory import slices_of
+import numpy as np
+
+from handtouch.core.memory import row_count, slices_of
 from handtouch.core.stages import force, locate, pairs, tables, tolerances
 from handtouch.field import contact_law
 
-VALUE_SLICES = slices_of(
-    xy=2,  # on the pad's rectangle
-    pad_m=2,
-    residual=1,
-    position_m=3,
-    normal=3,
-    force_n=1,
-    force_std_n=1,
-    residual_std=1,  # from channel noise and baseline
-    covariance_m2=9,  # without that of the mount
-    mount_covariance_m2=9,
-    pad_noise_m2=3,  # of pad_m from channel noise: uu, uv, vv
-    force_status=1,  # of `stages.force`
-    cells=2,  # position in the pad's table, where the next tick starts from
-    squared_misfit=1,  # of a point, see MAX_SQUARED_MISFIT
-    is_bound=1,  # 1 where saturated channels leave the position open
+VALUE_ROW = np.dtype(
+    [
+        ("xy", "<f8", 2),  # on the pad's rectangle
+        ("pad_m", "<f8", 2),
+        ("residual", "<f8"),
+        ("position_m", "<f8", 3),
+        ("normal", "<f8", 3),
+        ("force_n", "<f8"),
+        ("force_std_n", "<f8"),
+        ("residual_std", "<f8"),  # from channel noise and baseline
+        ("covariance_m2", "<f8", 9),  # without that of the mount
+        ("mount_covariance_m2", "<f8", 9),
+        ("pad_noise_m2", "<f8", 3),  # of pad_m from channel noise: uu, uv, vv
+        ("force_status", "<f8"),  # of `stages.force`
+        ("cells", "<f8", 2),  # position in the pad's table, where the next tick starts from
+        ("squared_misfit", "<f8"),  # of a point, see MAX_SQUARED_MISFIT
+        ("is_bound", "<f8"),  # 1 where saturated channels leave the position open
+    ]
 )
+VALUE_SLICES = slices_of(VALUE_ROW)
 """Layout of a row of values."""
 _X, _U, _RESIDUAL = VALUE_SLICES["xy"].start, VALUE_SLICES["pad_m"].start, VALUE_SLICES["residual"].start
 _POSITION, _NORMAL = VALUE_SLICES["position_m"].start, VALUE_SLICES["normal"].start
@@ -37,24 +42,27 @@ _RESIDUAL_STD, _FORCE_STATUS = VALUE_SLICES["residual_std"].start, VALUE_SLICES[
 _COVARIANCE, _MOUNT = VALUE_SLICES["covariance_m2"].start, VALUE_SLICES["mount_covariance_m2"].start
 _PAD_NOISE, _CELLS = VALUE_SLICES["pad_noise_m2"].start, VALUE_SLICES["cells"].start
 _MISFIT, _IS_BOUND = VALUE_SLICES["squared_misfit"].start, VALUE_SLICES["is_bound"].start
-_COUNT = max(at.stop for at in VALUE_SLICES.values())
+_COUNT = row_count(VALUE_ROW)
 VALUE_COUNT = _COUNT
-PART_SLICES = slices_of(
-    position_m=3,
-    normal=3,
-    covariance_m2=9,
-    force_n=1,
-    force_std_n=1,
-    id=1,  # this and the following stay while there is one contact
-    place=2,  # on the pad's rectangle
-    newest_id=1,  # of the pad, in the first of two
+PART_ROW = np.dtype(
+    [
+        ("position_m", "<f8", 3),
+        ("normal", "<f8", 3),
+        ("covariance_m2", "<f8", 9),
+        ("force_n", "<f8"),
+        ("force_std_n", "<f8"),
+        ("id", "<f8"),  # this and the following stay while there is one contact
+        ("place", "<f8", 2),  # on the pad's rectangle
+        ("newest_id", "<f8"),  # of the pad, in the first of two
+    ]
 )
+PART_SLICES = slices_of(PART_ROW)
 """Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
 _PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
 _PART_COVARIANCE, _PART_FORCE = PART_SLICES["covariance_m2"].start, PART_SLICES["force_n"].start
 _PART_FORCE_STD, _PART_ID = PART_SLICES["force_std_n"].start, PART_SLICES["id"].start
 _PART_PLACE, _PART_NEWEST = PART_SLICES["place"].start, PART_SLICES["newest_id"].start
-_PART_COUNT = max(at.stop for at in PART_SLICES.values())
+_PART_COUNT = row_count(PART_ROW)
 _PARTS_COUNT = 2 * _PART_COUNT
 PART_COUNT, PARTS_COUNT = _PART_COUNT, _PARTS_COUNT
 _MOUNT_COUNT = 5
