@@ -8,7 +8,8 @@ world's radii. The truth is the centre of the pressure that is on the pad. *Lear
 calibration by 56 more such contacts of each pad.
 
 *Disturbances*: evenly pressed round contacts of the same hands with one property more, or another one, which
-the file doesn't state. Errors and deviations in mm; intervals of shares by pads.
+the file doesn't state; leads and gains also after calibration by 56 such contacts. Errors and
+deviations in mm; intervals of shares by pads.
 """
 
 from __future__ import annotations
@@ -88,6 +89,8 @@ class Disturbance:
     """Touches over an edge."""
     is_noise: bool = False
     """Its noise is measured before."""
+    learns: bool = False
+    """Contacts calibrate the pads, too."""
 
 
 DISTURBANCES = (
@@ -97,7 +100,10 @@ DISTURBANCES = (
         Disturbance(f"film uneven, waves of {100 * amplitude:g} %", parts(unevenness=Normal(0.0, amplitude)))
         for amplitude in (0.02, 0.04)
     ),
-    *(Disturbance(f"leads of 0 to {ohm:g} ohm", parts(lead_ohm=Uniform(0.0, ohm))) for ohm in (5, 10, 30)),
+    *(
+        Disturbance(f"leads of 0 to {ohm:g} ohm", parts(lead_ohm=Uniform(0.0, ohm)), learns=True)
+        for ohm in (5, 10, 30)
+    ),
     *(Disturbance(f"noise times {n:g}", electronics(noise_ratio=Fixed(n)), is_noise=True) for n in (3, 10)),
     *(Disturbance(f"hum of {n:g} counts", electronics(hum_counts=Fixed(n)), is_noise=True) for n in (3, 10)),
     Disturbance("common noise of 10 counts", electronics(common_noise_counts=Fixed(10.0)), is_noise=True),
@@ -106,7 +112,10 @@ DISTURBANCES = (
         for n in (2, 8)
     ),
     Disturbance("crosstalk of 1 %", electronics(crosstalk=Fixed(0.01))),
-    *(Disturbance(f"one gain wrong by {100 * step:g} %", gain_step=1 + step) for step in (0.05, 0.1)),
+    *(
+        Disturbance(f"one gain wrong by {100 * step:g} %", gain_step=1 + step, learns=True)
+        for step in (0.05, 0.1)
+    ),
     Disturbance("water beside the contact, 10 %", beside=0.19),
 )
 
@@ -120,6 +129,7 @@ class Task:
     number: int
     each: int
     learns: bool
+    family: Family
 
 
 def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
@@ -151,8 +161,8 @@ def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tup
 
 def play(task: Task) -> dict[str, Estimates]:
     """Return estimates of position and of force of a hand, in each state."""
-    drawn = task.disturbance.world.draw(Family.REPORTING.seed(task.number))
-    builder = WORLD.draw(Family.REPORTING.seed(task.number))
+    seed = task.family.seed(task.number)
+    drawn, builder = task.disturbance.world.draw(seed), WORLD.draw(seed)
     deployment = builder.describe(load(shipped.path("utah_mit.toml")))
     model = build_pad_model(deployment)
     first = WARM_UP + (QUIET if task.disturbance.is_noise else 0)
@@ -240,22 +250,24 @@ def main() -> None:
     parser.add_argument("--disturbed", type=int, default=3, help="hands of each disturbance")
     parser.add_argument("--each", type=int, default=5, help="touches of a pad in each profile and range")
     parser.add_argument("--only", default="", help="profiles, or disturbances whose names contain this")
+    parser.add_argument("--tuning", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.disturbed, asked.each = 1, 1, 1
+    family = Family.TUNING if asked.tuning else Family.REPORTING
     profiles = [
-        Task(DISTURBANCES[0], SHAPES, number, asked.each, True)
+        Task(DISTURBANCES[0], SHAPES, number, asked.each, True, family)
         for number in range(asked.hands if asked.only in ("", "profiles") else 0)
     ]
     disturbed = [
-        Task(one, ROUND, number, asked.each, one.gain_step != 1)
+        Task(one, ROUND, number, asked.each, one.learns, family)
         for one in DISTURBANCES
         if asked.only in one.name
         for number in range(asked.disturbed)
     ]
     report = Report(
-        asked.quick or bool(asked.only),
+        asked.quick or asked.tuning or bool(asked.only),
         hands=asked.hands,
         hands_of_a_disturbance=asked.disturbed,
         touches_of_a_pad_in_a_cell=asked.each,

@@ -47,7 +47,7 @@ from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
-from handtouch.hand import electrode_network, models_with_other_parts, part_stds
+from handtouch.hand import electrode_network, models_with_other_parts, part_limits, part_stds
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -137,7 +137,7 @@ def learn(
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     network = electrode_network(pad, sheet)
     others = models_with_other_parts(network, pad, node, sheet)
-    calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet))
+    calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet), part_limits(pad, node))
     calibrator.assign_node(row + 1, None, None, "", 0)
     noise_a = contact_noise_a(model, row)
     found: list[Learning] = []

@@ -321,6 +321,33 @@ def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
     assert 7 < np.mean(joint) < 15
 
 
+@pytest.mark.parametrize("leads_ohm", [(1.5, 0.2, 0.9, 2.0), (22.0, 3.0, 14.0, 8.0)])
+def test_leads_are_found_however_large_and_as_certain_as_before_where_they_are_as_stated(
+    leads_ohm: tuple[float, ...],
+) -> None:
+    stated_ohm, rng = 1.2, np.random.default_rng(3)
+    nominal = ElectrodeNetwork(0.03, 0.024, 8e-4, 2400.0)
+    parts = [nominal.with_series_ohm((stated_ohm * one).tolist()) for one in np.eye(4)]
+    readings = contacts(nominal.with_series_ohm(leads_ohm), 96, 1e-4)
+    readings = readings + 2e-4 * readings.sum(axis=0) * rng.normal(size=readings.shape)  # of patches
+    found = {}
+    for limit in (1.0, 20.0):
+        estimator = plain(nominal, parts=parts, part_limits=limit)
+        estimator.add_contacts(readings, 1e-4, 0)
+        found[limit] = estimator.estimate
+    error = np.log(found[20.0].gains) - TRUTH, found[20.0].part_offsets - np.array(leads_ohm) / stated_ohm
+    joint = np.concatenate(error)
+    distance = joint @ np.linalg.pinv(found[20.0].joint_covariance, rcond=1e-9) @ joint
+    assert distance < 24  # 0.1 % of chi-squared of 7 degrees of freedom
+    if max(leads_ohm) < 2 * stated_ohm:
+        assert found[20.0].widening < 2
+        assert found[20.0].std < 1.3 * found[1.0].std
+    else:
+        assert found[20.0].widening > 5
+        unknown = np.log(found[1.0].gains) - TRUTH
+        assert unknown @ np.linalg.pinv(found[1.0].covariance, rcond=1e-6) @ unknown > 24
+
+
 def test_errors_of_each_touch_are_estimated_and_widen_the_covariance() -> None:
     """As of patches that aren't round: their scores are no outliers; gains stay within the covariance."""
     readings, rng = contacts(SQUARE, 256, 1e-4), np.random.default_rng(5)

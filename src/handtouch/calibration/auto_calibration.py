@@ -46,6 +46,9 @@ _MAX_CALIBRATED_LOG_GAIN_STD = 0.02
 change a position: by 0.3 to 0.5 % of the pad's length, rms, from 1:1 to 2:1."""
 _MODEL_ERROR, _MODEL_ERROR_WITHOUT_PARTS = 5e-5, 5e-4
 """Standard deviation of the fractions by what neither gains nor parts with tolerances explain."""
+_MIN_REPORTED_WIDENING = 3.0
+"""Deviation of a pad's leads, over that stated, from which on they are reported: four leads as stated have it
+in 1 of 10^6 pads."""
 _MANUAL_REMEDY = "measure them with `handtouch calibrate`"
 
 
@@ -71,11 +74,15 @@ class GainUpdate:
 
 
 def new_gain_estimator(
-    model: ForwardModel, attempt: int = 0, own: Gains | None = None, parts: Sequence[FractionModel] = ()
+    model: ForwardModel,
+    attempt: int = 0,
+    own: Gains | None = None,
+    parts: Sequence[FractionModel] = (),
+    part_limits: Sequence[float] = (),
 ) -> GainEstimator:
     """Return the estimator of a pad's gains, about gains of its `own` or the deployment's.
 
-    `parts`: see `GainEstimator`.
+    `parts`, `part_limits`: see `GainEstimator`.
     `attempt`: 0, then 1, with a wider prior, where no gains near these explain the contacts.
     """
     return GainEstimator(
@@ -88,6 +95,7 @@ def new_gain_estimator(
         part_offsets=own.parts.offsets if own and own.parts else None,
         joint_covariance=own.parts.covariance if own and own.parts else None,
         parts=parts,
+        part_limits=part_limits if parts else 1.0,
     )
 
 
@@ -95,13 +103,18 @@ class AutoCalibrator:
     """Calibration state and gain estimate of the node at one pad.
 
     model: the pad's. parts: models in each of which one of its parts differs by one standard deviation, and
-    these, part_stds.
+    these, part_stds; part_limits: how many times that much they may differ by.
     """
 
     def __init__(
-        self, model: ForwardModel, parts: Sequence[FractionModel] = (), part_stds: Sequence[float] = ()
+        self,
+        model: ForwardModel,
+        parts: Sequence[FractionModel] = (),
+        part_stds: Sequence[float] = (),
+        part_limits: Sequence[float] | None = None,
     ) -> None:
         self._model, self._parts, self.part_stds = model, parts, tuple(part_stds)
+        self._part_limits = tuple(part_limits or (1.0,) * len(parts))
         self.serial: int | None = None
         self.calibration_state = CalibrationState.DEFAULT
         self.can_learn = False
@@ -112,7 +125,7 @@ class AutoCalibrator:
         self.since_ns, self._attempt, self._store_at_contacts = 0, 0, 0
         self._has_own_gains = False  # the estimate started from gains of its own
         self._mean_gain = 1.0  # geometric mean, not observable by contacts
-        self._estimator = new_gain_estimator(model, parts=parts)
+        self._estimator = new_gain_estimator(model, parts=parts, part_limits=self._part_limits)
         self.estimate = self._estimator.estimate
 
     def assign_node(
@@ -206,7 +219,22 @@ class AutoCalibrator:
             and not self.estimate.contacts
         ):
             return f"gains set or stored, known to {100 * self.estimate.std:.2g} %; contacts refine them"
-        return f"gains {self.estimate.status}: {self.estimate.reason}"
+        return f"gains {self.estimate.status}: {self.estimate.reason}{self._found_leads}"
+
+    @property
+    def _found_leads(self) -> str:
+        """Resistances of leads beyond what the deployment states, as text; empty where they are as stated."""
+        found, leads = self.estimate, np.flatnonzero(np.array(self._part_limits) > 1)
+        if found.status is not GainStatus.ESTIMATED or found.widening < _MIN_REPORTED_WIDENING:
+            return ""
+        stds = np.array(self.part_stds)[leads]
+        ohm = found.part_offsets[leads] * stds
+        std = np.sqrt(np.diag(found.joint_covariance)[len(found.gains) + leads]) * stds
+        values = ", ".join(f"{value:.0f} +- {error:.0f}" for value, error in zip(ohm, std, strict=True))
+        return (
+            f"; from its electrodes to their channels are {values} ohm besides series_ohm, "
+            f"{stds.max():.2g} stated (series_std_ohm): check leads and plugs; positions allow for it"
+        )
 
     @property
     def diagnoses(self) -> tuple[Diagnosis, ...]:
@@ -281,6 +309,6 @@ class AutoCalibrator:
     def _restart_estimator(self, attempt: int, own: Gains | None = None) -> None:
         self._attempt, self._pending, self._has_own_gains = attempt, [], own is not None
         self._mean_gain = math.exp(np.log(own.factors).mean()) if own else 1.0
-        self._estimator = new_gain_estimator(self._model, attempt, own, self._parts)
+        self._estimator = new_gain_estimator(self._model, attempt, own, self._parts, self._part_limits)
         self.estimate = self._estimator.estimate
         self._store_at_contacts = _MIN_CONTACTS_TO_STORE_AGAIN

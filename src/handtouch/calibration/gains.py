@@ -57,6 +57,7 @@ _CELLS_PER_SIDE = 10  # a side
 _MEMORY_CONTACTS = 128.0  # contacts over which the share of points is estimated
 _MIN_OUTLIER_VARIANCE = 25.0  # variance of the scores of contacts that are no points, at least
 _MIN_INFORMATION_FRACTION = 0.2  # part of a batch's information that counts, however unlikely its contacts
+_PART_RATIOS = 12  # of deviations of parts to stated ones that are tried
 _MEDIAN_SQUARED_SCORE = 0.4549  # median of the square of a standard normal number
 _DAY_NS = 86_400e9
 
@@ -79,6 +80,8 @@ class GainEstimate:
         scores beyond noise; patches that aren't round have one.
     part_offsets: (p,) of the other parts, in their standard deviations as stated.
     joint_covariance: (c + p, c + p) of the logarithms of the gains and of these.
+    widening: standard deviation of the parts that may be wider than stated, as these contacts show it, over
+        that stated; at least 1.
     contacts: number used. effective_contacts: number that counts, once those at one position and those that
         are no points are discounted. point_fraction: share of them that are points.
     misfit: root mean square score of recent points, near 1 where model and noise are right.
@@ -89,6 +92,7 @@ class GainEstimate:
     covariance: FloatArray
     part_offsets: FloatArray
     joint_covariance: FloatArray
+    widening: float
     touch_error: float
     contacts: int
     effective_contacts: float
@@ -117,6 +121,8 @@ class GainEstimator:
         `part_offsets` (p,) and the `joint_covariance` (c + p, c + p), if these were stored.
     parts: models in each of which one part, such as a gap, differs by one standard deviation; `model` itself
         for those without a tolerance.
+    part_limits: (p,) how many times that deviation a part may have at most, if contacts show that such parts
+        have more than stated; 1 by default. Stored parts were found so before.
 
     Raises ValueError for a parameter out of range.
     """
@@ -134,6 +140,7 @@ class GainEstimator:
         part_offsets: ArrayLike | None = None,
         joint_covariance: ArrayLike | None = None,
         parts: Sequence[FractionModel] = (),
+        part_limits: ArrayLike = 1.0,
     ) -> None:
         for name, value, least in (
             ("tolerance", tolerance, 1e-9),
@@ -151,7 +158,9 @@ class GainEstimator:
             self._log_gains = _normalised_logs(start, self._channels)
         self._parts, self._part_offsets = tuple(parts), np.zeros(len(parts))
         free, self._gain_basis = self._channels - 1, gain_basis(self._channels)
-        self._information: FloatArray = np.diag([tolerance**-2] * free + [1.0] * len(parts))
+        limits = np.asarray(part_limits if joint_covariance is None else 1.0, dtype=np.float64)
+        self._part_limits: FloatArray = np.broadcast_to(limits, len(parts))
+        self._information: FloatArray = np.diag([tolerance**-2] * free + (self._part_limits**-2.0).tolist())
         self._basis = np.eye(self._channels + len(parts))[:, 1:]
         self._basis[: self._channels, :free] = self._gain_basis
         if joint_covariance is not None and part_offsets is not None:
@@ -212,16 +221,19 @@ class GainEstimator:
         misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
         # scores wider than by noise: model errors of the points widen the covariance of the gains too
         widening = max(1.0, np.nan_to_num(misfit) ** 2)
-        joint = self._basis @ _inverse(self._information) @ self._basis.T
+        ratio = self._part_widening(widening)
+        information, log_gains, part_offsets = self._with_parts_as_wide(ratio)
+        joint = self._basis @ _inverse(information) @ self._basis.T
         joint *= widening
         basis, free = self._gain_basis, self._channels - 1
         with_parts_as_stated = basis @ _inverse(self._information[:free, :free]) @ basis.T * widening
         status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
         return GainEstimate(
-            np.exp(self._log_gains),
+            np.exp(log_gains),
             joint[: self._channels, : self._channels],
-            self._part_offsets.copy(),
+            part_offsets,
             joint,
+            ratio,
             math.sqrt(self._touch_variance),
             self._contacts,
             self._effective_contacts,
@@ -230,6 +242,38 @@ class GainEstimator:
             status,
             reason,
         )
+
+    def _part_widening(self, score_variance: float) -> float:
+        """Return the most likely deviation of the parts that may be wider than stated, over that, from 1 on.
+
+        The contacts' information about these parts alone is that of the estimate less that of its prior.
+        """
+        wide = np.flatnonzero(self._part_limits > 1)
+        if len(wide) == 0:
+            return 1.0
+        at = self._channels - 1 + wide
+        known = _inverse(_inverse(self._information)[np.ix_(at, at)])
+        score = known @ self._part_offsets[wide] / score_variance
+        known = (known - np.diag(self._part_limits[wide] ** -2.0)) / score_variance
+        ratios, evidence = np.geomspace(1.0, self._part_limits.max(), _PART_RATIOS), []
+        for ratio in ratios:
+            std = np.minimum(ratio, self._part_limits[wide])
+            total = known + np.diag(std**-2.0)
+            log_determinant = np.linalg.slogdet(total)[1] + 2 * np.log(std).sum()
+            evidence.append(score @ np.linalg.solve(total, score) - log_determinant)
+        return float(ratios[np.argmax(evidence)])
+
+    def _with_parts_as_wide(self, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return information, log gains and offsets of the parts with a prior of the parts that is `ratio`
+        times as wide as stated, up to their limits."""
+        free = self._channels - 1
+        more = np.minimum(ratio, self._part_limits) ** -2.0 - self._part_limits**-2.0
+        information = self._information.copy()
+        information[free:, free:] += np.diag(more)
+        step: FloatArray = np.zeros(len(information))
+        step[free:] = -more * self._part_offsets
+        step = np.asarray(np.linalg.solve(information, step), dtype=np.float64)
+        return information, self._log_gains + self._gain_basis @ step[:free], self._part_offsets + step[free:]
 
     def _assess(self, std: float) -> tuple[GainStatus, str]:
         if self._channels <= UNKNOWNS:

@@ -1,7 +1,7 @@
 """Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
 
 Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_network`,
-`models_with_other_parts`, `part_stds`, `PadGeometry`, `LinkContacts`.
+`models_with_other_parts`, `part_stds`, `part_limits`, `PadGeometry`, `LinkContacts`.
 """
 
 from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
@@ -13,6 +13,7 @@ from handtouch.hand.pads import (
     network_parameters,
     pad_network,
     pad_surface,
+    part_limits,
     part_stds,
 )
 
@@ -26,5 +27,6 @@ __all__ = [
     "network_parameters",
     "pad_network",
     "pad_surface",
+    "part_limits",
     "part_stds",
 ]

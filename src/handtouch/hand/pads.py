@@ -1,8 +1,8 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
 Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_network`, `electrode_network`,
-`models_with_other_parts`, `part_stds`, `series_ohm_stds`, `metres_per_unit`, `relative_size_stds`,
-`log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
+`models_with_other_parts`, `part_stds`, `part_limits`, `series_ohm_stds`, `metres_per_unit`,
+`relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
 _M_PER_MM = 1e-3
+LEAD_STD_OHM = 20.0
+"""Standard deviation of leads of silver ink, or of worn plugs, as contacts may find it: up to 35 ohm."""
 
 
 def pad_surface(pad: config.Pad) -> Surface:
@@ -143,6 +145,17 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
     resistors = (*series_ohm_stds(pad, node).tolist(), sheet_std)
     waves = (sheet.unevenness_std,) * len(UNEVEN_WAVES)
     return (*(sheet.gap_std_mm,) * (2 * count), log_aspect_std(pad, sheet), *waves, *resistors)
+
+
+def part_limits(pad: config.Pad, node: config.Node) -> tuple[float, ...]:
+    """Return how many times its stated deviation a pad's part may have, (p,) in the order of `part_stds`.
+
+    Only leads aren't known by those who state them: nobody sees what silver ink or a plug adds.
+    """
+    stds = series_ohm_stds(pad, node)
+    leads = np.maximum(LEAD_STD_OHM / np.where(stds > 0, stds, LEAD_STD_OHM), 1.0)
+    before = (1.0,) * (2 * len(stds) + 1 + len(UNEVEN_WAVES))
+    return (*before, *leads.tolist(), 1.0)
 
 
 def series_ohm_stds(pad: config.Pad, node: config.Node) -> NDArray[np.float64]:

@@ -33,7 +33,7 @@ from handtouch.config import Deployment
 from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_stds
+from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_limits, part_stds
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
@@ -112,7 +112,7 @@ class SupervisorWorker:
             if design not in models:
                 network = pad_network(pad, sheet)
                 others = models_with_other_parts(network, pad, node, sheet)
-                models[design] = network, others, part_stds(pad, node, sheet)
+                models[design] = network, others, part_stds(pad, node, sheet), part_limits(pad, node)
             mounting_point = MountingPoint(hand, pad.link, default_calibration_id_of(pad, deployment))
             detector = StationaryContactDetector(noise_counts_of(node) * scale)
             calibrator = AutoCalibrator(*models[design])
