@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import parse
-from handtouch.core import pad_tables
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages import force
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ContactLaw, ForceEstimateStatus
 from tests.core.conftest import TOLERANT_DEPLOYMENT
@@ -115,10 +115,10 @@ def test_fewer_nodes_for_nearly_log_normal_forces_give_force_and_deviation_of_ma
     forces = np.exp(np.random.default_rng(3).uniform(np.log(0.2), np.log(GREATEST_N), 300))
     text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
     few = solve_drawn(text, forces)
-    monkeypatch.setattr(pad_tables, "NEAR_FORCE_NODES", 24)
-    pad_tables.stack_table.cache_clear()
+    monkeypatch.setattr(force, "NEAR_FORCE_NODES", 24)
+    force.stack_table.cache_clear()
     many = solve_drawn(text, forces)
-    pad_tables.stack_table.cache_clear()
+    force.stack_table.cache_clear()
     valid = many[2] == ForceEstimateStatus.VALID
     assert valid.mean() > 0.9
     assert np.array_equal(few[2], many[2])

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pad_tables import SEARCH_POINTS, stack_table
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT, SEARCH_POINTS
+from handtouch.core.stages.force import stack_table
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.pairs import PairFit, grid_points, work_size
 from handtouch.core.stages.solve import (
-    MAX_SQUARED_MISFIT,
     PART_COUNT,
     PART_SLICES,
     PARTS_COUNT,
@@ -23,8 +23,8 @@ from handtouch.core.stages.solve import (
     VALUE_SLICES,
     ContactSolver,
 )
-from handtouch.core.stages.tables import Placement
-from handtouch.core.stages.tolerances import PartKnowledge, Whitening, part_count
+from handtouch.core.stages.tables import PadSurface, Placement
+from handtouch.core.stages.tolerances import PartKnowledge
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +47,6 @@ def make_solver(
     noise_squared: (pads, channels), variances of the channels as measured [counts^2].
     """
     n, points = currents.shape[1], grid_points(SEARCH_POINTS)
-    most = int(model.state_counts.max())
     limits, moments = model.pair_settings()
     if parts is None:
         parts = np.full((model.size, PARTS_COUNT), np.nan)
@@ -55,30 +54,19 @@ def make_solver(
         noise_squared = np.zeros(currents.shape)
     if saturated is None:
         saturated = np.zeros(currents.shape, dtype=np.bool_)
-    raw, beside, gain = _work(3 * (n + 1)), _work(3 * (n + 1)), _work(SEARCH_POINTS**2)
-    whitening = Whitening(
-        *(_work(n * n), _work(n), _work(n), _work((8 + 2 * most) * n), _work(part_count(n) * n)),
-        *(_work(n * (n + part_count(n))), _work(n), n),
-    )
-    fit = Fit(
-        _work(n), _work(n), _work(n), _work(n), _work(n), _work(n), raw, beside, _work(n), gain, whitening
-    )
     return ContactSolver(
         model.stage_tables(),
         model.stage_tolerances(),
         model.stage_laws(),
-        [surface.pad_surface() for surface in model.surface_tables],
+        [PadSurface(surface) for surface in model.surface_tables],
         stack_table(),
-        fit,
-        Placement(_work(15)),
+        Fit(n, int(model.state_counts.max())),
+        Placement(),
         n,
         _work(3 * n),
         view_memory(currents),
         view_memory(model.weight),
-        PartKnowledge(
-            *(view_memory(model.part_axes), view_memory(model.part_axis_ends)),
-            *(view_memory(model.part_offsets), view_memory(model.touch_errors)),
-        ),
+        PartKnowledge(model),
         view_memory(model.gain_covariance),
         view_memory(offset_std_a),
         view_memory(force_requested),

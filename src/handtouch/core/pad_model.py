@@ -22,12 +22,11 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
-from handtouch.core.part_tolerances import shape_error, stage_tolerances
 from handtouch.core.shear import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
 from handtouch.core.stages.locate import ModelTable
-from handtouch.core.stages.tolerances import PadTolerances, part_count
+from handtouch.core.stages.tolerances import PadTolerances, part_count, shape_error
 from handtouch.field.contact_law import ContactLaw
 from handtouch.field.contact_stack import stack_factor
 from handtouch.field.network import ElectrodeNetwork
@@ -321,12 +320,12 @@ class PadModel:
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""
         columns = zip(self._parts, self.networks, self.forward_tables, strict=True)
-        return [stage_tolerances(*parts, network, table) for parts, network, table in columns]
+        return [PadTolerances(*parts, network, table) for parts, network, table in columns]
 
     def stage_tables(self) -> list[ModelTable]:
         """Return the forward models as the stages take them."""
         pads = zip(self.forward_tables, self.state_counts.tolist(), strict=True)
-        return [table.pad_table(states) for table, states in pads]
+        return [ModelTable(table, states) for table, states in pads]
 
     def pair_settings(self) -> FloatArray:
         """Return the limit (n,) of one contact's squared misfit beyond which two are tried, and the deviation

@@ -1,6 +1,6 @@
-"""Tables of forward models and surfaces for the stages, built once for each distinct pad.
+"""Tables of forward models and surfaces that the stages read, built once for each distinct pad.
 
-Public names: `ForwardTable`, `SurfacePatches`, `stack_table`, `hermite_table`, `pair_limit`.
+Public names: `ForwardTable`, `SurfacePatches`, `hermite_table`, `pair_limit`, `MAX_SQUARED_MISFIT`.
 
 A forward model is tabulated over cells that shrink towards the edges and the ends of the electrodes, as the
 distances do over which its fractions vary.
@@ -17,13 +17,6 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import view_memory
-from handtouch.core.stages.force import MAX_SIGMA, StackTable
-from handtouch.core.stages.locate import ModelTable
-from handtouch.core.stages.solve import MAX_SQUARED_MISFIT
-from handtouch.core.stages.tables import PadSurface
-from handtouch.field.contact_law import log_stack_inverse
-from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import spreading_radius
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
@@ -46,16 +39,12 @@ _MIN_RADIUS_DISTANCE = 1e-3  # distance over a side: the spreading radius vanish
 _SURFACE_CELLS = (8, 16, 32, 64)
 _MAX_SURFACE_ERROR = 1e-7
 """Error between the nodes over a pad's size."""
-_STACK_INTERVALS = 2048
-_MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
-_MIN_LOG_X2, _MAX_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1 / 16
-FORCE_NODES = 12
-"""Nodes of the quadrature over ln x^2. Beside 96 nodes, on 3,703 contacts of random sheet, law, radius,
-current, place, up to the maximum current, forces are within 0.05 of their standard deviation (99 %: 0.007),
-and that within 9 % (99 %: 1 %); with 8 nodes within 0.14 and 9 % (99 %: 0.03 and 2 %)"""
-NEAR_FORCE_NODES = 5
-"""The same where the force is nearly log-normal: beside 64 nodes, on 5,585 such contacts of 26,047 of random
-sheet, law, radius, current and place, forces are within 0.01 of their standard deviation, that within 2 %"""
+MAX_SQUARED_MISFIT = 9.0
+"""Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
+n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
+covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932), as the errors of currents along the
+directions that move the position are as large as along the observable one, and of four currents by the extent
+that explains the residual."""
 
 
 def hermite_table(values: FloatArray) -> FloatArray:
@@ -163,19 +152,20 @@ class ForwardTable:
             series_vectors=np.ascontiguousarray(floating.series_sensitivity.T),
         )
 
-    def pad_table(self, states: int = 1) -> ModelTable:
-        """Return it as the stages take it; `states`: of a schedule, whose totals are free but for one."""
-        return ModelTable(
-            view_memory(self.nodes),
-            len(self.nodes) - 1,
-            self.electrodes,
-            view_memory(self.nodes_x),
-            view_memory(self.nodes_y),
-            view_memory(self.search_fractions),
-            view_memory(self.search_cells),
-            SEARCH_POINTS,
-            _misfit_scale(_live_electrodes(self) - (states - 1)),
-        )
+    def misfit_scale(self, states: int = 1) -> float:
+        """Return the factor from a squared misfit of n currents at the limit to MAX_SQUARED_MISFIT, which is
+        as likely of one degree of freedom (chi-squared by Wilson and Hilferty, PNAS 17, 1931).
+
+        states: of a schedule, whose totals are free but for one.
+        """
+        freedom = self.live_electrodes() - (states - 1) - 3
+        if freedom <= 1:
+            return 1.0
+        return MAX_SQUARED_MISFIT / _chi_squared(freedom, math.erfc(math.sqrt(MAX_SQUARED_MISFIT / 2)))
+
+    def live_electrodes(self) -> int:
+        """Return the number of electrodes that collect current."""
+        return int(np.count_nonzero(self.search_fractions.any(axis=0)))
 
 
 def _spreading_nodes(
@@ -197,15 +187,6 @@ def _log_spreading(model: ElectrodeNetwork, x: FloatArray, y: FloatArray) -> Flo
     return np.asarray(log_radius + 2 * math.pi * added_ohm / model.sheet_ohm_per_square)
 
 
-def _misfit_scale(electrodes: int) -> float:
-    """Return the factor from a squared misfit of n currents at the limit to MAX_SQUARED_MISFIT, which is as
-    likely of one degree of freedom (chi-squared by Wilson and Hilferty, PNAS 17, 1931)."""
-    freedom = electrodes - 3
-    if freedom <= 1:
-        return 1.0
-    return MAX_SQUARED_MISFIT / _chi_squared(freedom, math.erfc(math.sqrt(MAX_SQUARED_MISFIT / 2)))
-
-
 def _chi_squared(freedom: int, probability: float) -> float:
     """Return what chi-squared exceeds with this probability, by Wilson and Hilferty."""
     variance, deviations = 2 / (9 * freedom), NormalDist().inv_cdf(1 - probability)
@@ -218,15 +199,10 @@ def pair_limit(table: ForwardTable, false_alarm: float, states: int = 1) -> floa
     Infinite for a probability of 0, and for fewer than six currents: two contacts have six unknowns. Each of
     several `states` of a schedule after the first has one more, its total.
     """
-    electrodes = _live_electrodes(table) - (states - 1)
+    electrodes = table.live_electrodes() - (states - 1)
     if electrodes < MIN_PAIR_ELECTRODES or not false_alarm > 0:
         return math.inf
     return _chi_squared(electrodes - 3, false_alarm)
-
-
-def _live_electrodes(table: ForwardTable) -> int:
-    """Return the number of electrodes that collect current."""
-    return int(np.count_nonzero(table.search_fractions.any(axis=0)))
 
 
 class _Axis:
@@ -363,13 +339,6 @@ class SurfacePatches:
                 break
         return cls(np.ascontiguousarray(nodes), ends, surface.a)
 
-    def pad_surface(self) -> PadSurface:
-        """Return it as the stages take it."""
-        cells = self.nodes.shape[1] - 1
-        return PadSurface(
-            view_memory(self.nodes), 0, cells, self.nodes[0].size, view_memory(self.ends), self.side_x
-        )
-
 
 def _mid_cell_values(nodes: FloatArray) -> FloatArray:
     """Return the bicubics (..., y, x, columns) in the middle of the cells."""
@@ -383,45 +352,3 @@ def _mid_cell_values(nodes: FloatArray) -> FloatArray:
     value, by_x, by_y, by_both = np.moveaxis(nodes, -2, 0)
     x_axis = value.ndim - 2
     return middle(middle(value, by_x, x_axis), middle(by_y, by_both, x_axis), x_axis - 1)
-
-
-@cache
-def stack_table() -> StackTable:
-    """Return the contact stack's factor by ln x^2, its inverse, and the nodes of integrals over ln x^2."""
-    knots = np.linspace(_MIN_LOG_FACTOR, _MAX_LOG_FACTOR, _STACK_INTERVALS + 1)
-    width = float(knots[1] - knots[0])
-    level, by_factor = log_stack_inverse(np.exp(knots))
-    slope = by_factor * np.exp(knots) * width
-    chord, left, right = np.diff(level), slope[:-1], slope[1:]
-    pieces = np.stack([left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:-1]], axis=1)
-    log_x2 = np.arange(_MIN_LOG_X2, _MAX_LOG_X2 + _LOG_X2_WIDTH / 2, _LOG_X2_WIDTH)
-    factor = stack_factor(np.exp(log_x2 / 2))
-    by_log_x2 = (1 - np.exp(log_x2) * np.square(factor)) / 2
-    points, weights = np.polynomial.legendre.leggauss(FORCE_NODES)
-    near_points, near_weights = _normal_quadrature(NEAR_FORCE_NODES)
-    rules = np.stack([np.append(points, near_points), np.append(weights, near_weights)], axis=1)
-    rules[:, 0] = (1 + rules[:, 0]) / 2
-    return StackTable(
-        *(view_memory(np.ascontiguousarray(pieces)), _MIN_LOG_FACTOR, width),
-        *(view_memory(np.stack([factor, by_log_x2 * _LOG_X2_WIDTH], axis=1)), _MIN_LOG_X2, _LOG_X2_WIDTH),
-        *(view_memory(rules), FORCE_NODES),
-    )
-
-
-def _normal_quadrature(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights on -1 to 1 of Gauss's rule for the normal density within MAX_SIGMA deviations.
-
-    By Stieltjes's recurrence and the eigenvalues of Golub and Welsch; the weights are over the density.
-    """
-    points, weights = np.polynomial.legendre.leggauss(20 * count)
-    weights = weights * np.exp(-0.5 * np.square(MAX_SIGMA * points))
-    total = weights.sum()
-    before, present, norm = np.zeros_like(points), np.full_like(points, total**-0.5), 0.0
-    diagonal, beside = np.zeros(count), np.zeros(count)
-    for k in range(count):
-        diagonal[k] = weights @ (points * present**2)
-        following = (points - diagonal[k]) * present - norm * before
-        norm = beside[k] = np.sqrt(weights @ following**2)
-        before, present = present, following / norm
-    nodes, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
-    return nodes, total * vectors[0] ** 2 * np.exp(0.5 * np.square(MAX_SIGMA * nodes))

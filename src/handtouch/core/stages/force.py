@@ -17,8 +17,20 @@ force (Hertz), it is that of each force: A^3 ~ F, so ln F and ln A are still lin
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from handtouch.core.memory import view_memory
 from handtouch.field import contact_law
+from handtouch.field.contact_law import log_stack_inverse
+from handtouch.field.contact_stack import stack_factor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
 
 FITTED, BOUNDED, NOT_ESTIMATED, WIDE = 0, 1, 2, 4
 """Status of an estimate: a force; a lower bound; none; a force whose spread is too wide to rely on"""
@@ -30,8 +42,17 @@ _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_C
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
 _TWO_PI, _INFINITY, _NAN = 2.0 * math.pi, math.inf, float("nan")
-MAX_SIGMA = 3.3  # of the quadrature over the stack factor
-_MAX_SIGMA = MAX_SIGMA
+_MAX_SIGMA = 3.3  # of the quadrature over the stack factor
+_STACK_INTERVALS = 2048
+_MIN_LOG_FACTOR, _MAX_LOG_FACTOR = -16.0, 32.0
+_FIRST_LOG_X2, _LAST_LOG_X2, _LOG_X2_WIDTH = -24.0, 24.0, 1.0 / 16.0
+FORCE_NODES = 12
+"""Nodes of the quadrature over ln x^2. Beside 96 nodes, on 3,703 contacts of random sheet, law, radius,
+current, place, up to the maximum current, forces are within 0.05 of their standard deviation (99 %: 0.007),
+and that within 9 % (99 %: 1 %); with 8 nodes within 0.14 and 9 % (99 %: 0.03 and 2 %)"""
+NEAR_FORCE_NODES = 5
+"""The same where the force is nearly log-normal: beside 64 nodes, on 5,585 such contacts of 26,047 of random
+sheet, law, radius, current and place, forces are within 0.01 of their standard deviation, that within 2 %"""
 _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE = 0.7, 2.0, 0.3, 0.05
 """Limits within which a force is nearly log-normal: half the range of its logarithm; distance of the greatest
 one, shift of the range's middle and change of its half from those of a normal one, in such halves"""
@@ -57,22 +78,54 @@ class StackTable:
     interval at ln x^2 = first + k width. nodes: (2 count,) of Gauss and Legendre on 0 to 1, and weights.
     """
 
-    def __init__(
-        self,
-        inverse: memoryview[float],
-        inverse_first: float,
-        inverse_width: float,
-        values: memoryview[float],
-        first: float,
-        width: float,
-        nodes: memoryview[float],
-        any_count: int,
-    ) -> None:
-        self.inverse, self.inverse_intervals = inverse, len(inverse) // 4
-        self.inverse_first, self.inverse_width = inverse_first, inverse_width
-        self.values, self.intervals = values, len(values) // 2 - 1
-        self.first, self.per_width = first, 1.0 / width
-        self.nodes, self.any_count, self.near_count = nodes, any_count, len(nodes) // 2 - any_count
+    def __init__(self) -> None:
+        knots = np.linspace(_MIN_LOG_FACTOR, _MAX_LOG_FACTOR, _STACK_INTERVALS + 1)
+        width = float(knots[1] - knots[0])
+        level, by_factor = log_stack_inverse(np.exp(knots))
+        slope = by_factor * np.exp(knots) * width
+        last = _STACK_INTERVALS
+        chord, left, right = np.diff(level), slope[:last], slope[1:]
+        pieces = np.stack(
+            [left + right - 2 * chord, 3 * chord - 2 * left - right, left, level[:last]], axis=1
+        )
+        log_x2 = np.arange(_FIRST_LOG_X2, _LAST_LOG_X2 + _LOG_X2_WIDTH / 2, _LOG_X2_WIDTH)
+        factor = stack_factor(np.exp(log_x2 / 2))
+        by_log_x2 = (1 - np.exp(log_x2) * np.square(factor)) / 2
+        points, weights = np.polynomial.legendre.leggauss(FORCE_NODES)
+        near_points, near_weights = _normal_quadrature(NEAR_FORCE_NODES)
+        rules = np.stack([np.append(points, near_points), np.append(weights, near_weights)], axis=1)
+        rules[:, 0] = (1 + rules[:, 0]) / 2
+        self.inverse, self.inverse_intervals = view_memory(np.ascontiguousarray(pieces)), _STACK_INTERVALS
+        self.inverse_first, self.inverse_width = _MIN_LOG_FACTOR, width
+        self.values = view_memory(np.stack([factor, by_log_x2 * _LOG_X2_WIDTH], axis=1))
+        self.first, self.per_width, self.intervals = _FIRST_LOG_X2, 1.0 / _LOG_X2_WIDTH, len(factor) - 1
+        self.nodes, self.any_count, self.near_count = view_memory(rules), FORCE_NODES, NEAR_FORCE_NODES
+
+
+@cache
+def stack_table() -> StackTable:
+    """Return the table, which is the same for all pads."""
+    return StackTable()
+
+
+def _normal_quadrature(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return nodes and weights on -1 to 1 of Gauss's rule for the normal density within _MAX_SIGMA.
+
+    By Stieltjes's recurrence and the eigenvalues of Golub and Welsch; the weights are over the density.
+    """
+    points, weights = np.polynomial.legendre.leggauss(20 * count)
+    weights = weights * np.exp(-0.5 * np.square(_MAX_SIGMA * points))
+    total = weights.sum()
+    before, present, norm = np.zeros_like(points), np.full_like(points, total**-0.5), 0.0
+    diagonal, beside = np.zeros(count), np.zeros(count)
+    for k in range(count):
+        diagonal[k] = weights @ (points * present**2)
+        following = (points - diagonal[k]) * present - norm * before
+        norm = beside[k] = np.sqrt(weights @ following**2)
+        before, present = present, following / norm
+    beside = np.diag(beside[: count - 1], 1)
+    nodes, vectors = np.linalg.eigh(np.diag(diagonal) + beside + beside.T)
+    return nodes, total * vectors[0] ** 2 * np.exp(0.5 * np.square(_MAX_SIGMA * nodes))
 
 
 class PadLaw:

@@ -10,9 +10,17 @@ likelihood, limits and covariance as `handtouch.field.estimate`, which is the re
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import SEARCH_POINTS
 from handtouch.core.stages import tables, tolerances
 from handtouch.field.estimate import CORNER_RADIUS_FACTOR, MAX_STD_SIDES
+
+if TYPE_CHECKING:
+    from handtouch.core.pad_tables import ForwardTable
 
 _MAX_STEPS = 30
 _MAX_STEP_CELLS = 7.0
@@ -48,27 +56,15 @@ class ModelTable:
     from the squared misfit of n currents, n - 3 degrees of freedom, to one that is as likely of one.
     """
 
-    def __init__(
-        self,
-        values: memoryview[float],
-        cells: int,
-        electrodes: int,
-        nodes_x: memoryview[float],
-        nodes_y: memoryview[float],
-        search_fractions: memoryview[float],
-        search_cells: memoryview[float],
-        points: int,
-        misfit_scale: float,
-    ) -> None:
-        self.values = values
-        self.cells = cells
-        self.electrodes = electrodes
-        self.nodes_x, self.nodes_y = nodes_x, nodes_y
-        self.side_x, self.side_y = nodes_x[2 * cells], nodes_y[2 * cells]
-        self.search_fractions = search_fractions
-        self.search_cells = search_cells
-        self.points = points
-        self.misfit_scale = misfit_scale
+    def __init__(self, table: ForwardTable, states: int) -> None:
+        """Take a pad's table; `states`: of a schedule, 1 without one."""
+        self.values = view_memory(table.nodes)
+        self.cells, self.electrodes, self.points = len(table.nodes) - 1, table.electrodes, SEARCH_POINTS
+        self.nodes_x, self.nodes_y = view_memory(table.nodes_x), view_memory(table.nodes_y)
+        self.side_x, self.side_y = table.nodes_x[self.cells, 0], table.nodes_y[self.cells, 0]
+        self.search_fractions = view_memory(table.search_fractions)
+        self.search_cells = view_memory(table.search_cells)
+        self.misfit_scale = table.misfit_scale(states)
 
 
 class Fit:
@@ -81,24 +77,16 @@ class Fit:
     `gain` (points,): reduction of the cost by a contact at each search point.
     """
 
-    def __init__(
-        self,
-        readings: memoryview[float],
-        data: memoryview[float],
-        weight: memoryview[float],
-        fractions: memoryview[float],
-        slope_x: memoryview[float],
-        slope_y: memoryview[float],
-        raw: memoryview[float],
-        beside: memoryview[float],
-        scaled: memoryview[float],
-        gain: memoryview[float],
-        whitening: tolerances.Whitening,
-    ) -> None:
-        self.readings, self.data, self.weight = readings, data, weight
-        self.scaled, self.whitening = scaled, whitening
-        self.fractions, self.slope_x, self.slope_y = fractions, slope_x, slope_y
-        self.raw, self.beside, self.gain = raw, beside, gain
+    def __init__(self, channels: int, states: int) -> None:
+        """Prepare for pads of at most so many electrodes, and states of a schedule."""
+        n, columns = channels, channels + 1
+        self.readings, self.data = view_memory(np.zeros(n)), view_memory(np.zeros(n))
+        self.weight, self.scaled = view_memory(np.zeros(n)), view_memory(np.zeros(n))
+        self.fractions = view_memory(np.zeros(n))
+        self.slope_x, self.slope_y = view_memory(np.zeros(n)), view_memory(np.zeros(n))
+        self.raw, self.beside = view_memory(np.zeros(3 * columns)), view_memory(np.zeros(3 * columns))
+        self.gain = view_memory(np.zeros(SEARCH_POINTS**2))
+        self.whitening = tolerances.Whitening(channels, states)
         self.s = self.t = 0.0  # position, in cells
         self.read_s = self.read_t = _INFINITY  # the same of what was read from the table
         self.whitened_s = self.whitened_t = 0.0  # and for which tolerances were whitened

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from handtouch.core.memory import row_count
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.force import BOUNDED, WIDE
 from handtouch.core.stages.frames import FRAME_ROW, PART_FRAMES
-from handtouch.core.stages.solve import MAX_SQUARED_MISFIT, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
 from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
 
 _VALUES = VALUE_COUNT

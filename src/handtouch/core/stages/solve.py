@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from handtouch.core.memory import row_count, slices_of
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages import force, locate, pairs, tables, tolerances
 from handtouch.field import contact_law
 
@@ -71,12 +72,6 @@ MOUNT_COUNT = _MOUNT_COUNT
 _NAN = float("nan")
 _FITTED, _BOUNDED = float(force.FITTED), float(force.BOUNDED)
 _BOUND_SIGMA = contact_law.BOUND_SIGMA
-MAX_SQUARED_MISFIT = 9.0
-"""Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
-n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
-covariance is inflated by the excess (Birge, Phys. Rev. 40, 1932), as the errors of currents along the
-directions that move the position are as large as along the observable one, and of four currents by the extent
-that explains the residual."""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
 _TWO_PI, _INFINITY = 2.0 * math.pi, math.inf

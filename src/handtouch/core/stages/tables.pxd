@@ -13,7 +13,7 @@ cdef void read_values(float[::1] table, Py_ssize_t cells, Py_ssize_t columns, do
 
 cdef class PadSurface:
     cdef double[::1] values, ends
-    cdef Py_ssize_t first, cells, patch_floats, patches
+    cdef Py_ssize_t cells, patch_floats, patches
     cdef double side_x
 
 cdef class Placement:

@@ -8,6 +8,14 @@ across, per cell. Between the nodes it is the bicubic Hermite polynomial of thes
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from handtouch.core.memory import view_memory
+
+if TYPE_CHECKING:
+    from handtouch.core.pad_tables import SurfacePatches
 
 _COLUMNS = 5  # of a surface
 
@@ -103,34 +111,22 @@ def read_values(
 class PadSurface:
     """Surface of one pad in its link's frame, in smooth patches that meet at folds across y.
 
-    values: one table a patch, as `read_table` needs them, of `patch_floats` floats each, from index `first`
-    on; columns are position (3) [m] and arc lengths from the electrodes x0 and y0 (2) [m], on an even grid.
-    ends: (patches,), where each patch ends along y. side_x: of the pad's rectangle.
+    values: one table a patch, as `read_table` needs them, of `patch_floats` floats each; columns are position
+    (3) [m] and arc lengths from the electrodes x0 and y0 (2) [m], on an even grid. ends: (patches,), where
+    each patch ends along y. side_x: of the pad's rectangle.
     """
 
-    def __init__(
-        self,
-        values: memoryview[float],
-        first: int,
-        cells: int,
-        patch_floats: int,
-        ends: memoryview[float],
-        side_x: float,
-    ) -> None:
-        self.values = values
-        self.first = first
-        self.cells = cells
-        self.patch_floats = patch_floats
-        self.ends = ends
-        self.patches = len(ends)
-        self.side_x = side_x
+    def __init__(self, surface: SurfacePatches) -> None:
+        self.values, self.ends = view_memory(surface.nodes), view_memory(surface.ends)
+        self.cells, self.patch_floats = surface.nodes.shape[1] - 1, surface.nodes[0].size
+        self.patches, self.side_x = len(surface.ends), surface.side_x
 
 
 class Placement:
     """A contact in its link's frame. `raw` (15,): what was read from the table."""
 
-    def __init__(self, raw: memoryview[float]) -> None:
-        self.raw = raw
+    def __init__(self) -> None:
+        self.raw = view_memory(np.zeros(3 * _COLUMNS))
         self.u_m = self.v_m = 0.0
         self.px = self.py = self.pz = 0.0
         self.nx = self.ny = self.nz = 0.0
@@ -150,7 +146,7 @@ def place_contact(surface: PadSurface, placement: Placement, x: float, y: float)
     per_x, per_y = cells / surface.side_x, cells / (surface.ends[patch] - begin)
     s, t = max(0.0, min(1.0 * cells, x * per_x)), max(0.0, min(1.0 * cells, (y - begin) * per_y))
     raw = placement.raw
-    read_table(surface.values, surface.first + patch * surface.patch_floats, cells, _COLUMNS, s, t, raw)
+    read_table(surface.values, patch * surface.patch_floats, cells, _COLUMNS, s, t, raw)
     placement.px, placement.py, placement.pz = raw[0], raw[1], raw[2]
     placement.u_m, placement.v_m = raw[3], raw[4]
     tx, ty, tz = raw[5] * per_x, raw[6] * per_x, raw[7] * per_x

@@ -4,78 +4,110 @@ Every tolerance changes the fractions along one vector: a gain by its own fracti
 by a constant vector times a field on the pad (Hadamard: of the potentials, only the strength of their
 singularity at that end differs); a series resistor by a constant vector times its fraction; the ratio of the
 pad's sides and each wave of its sheet's resistance by a vector of fields.
+
+Public names: `PadTolerances`, `PartKnowledge`, `Whitening`, `part_count`, `shape_error`, `overhangs`.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from handtouch.config.channels import channel_states
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages import tables
+from handtouch.hand.pads import (
+    log_aspect_std,
+    metres_per_unit,
+    pad_surface,
+    relative_size_stds,
+    series_ohm_stds,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from handtouch import config
+    from handtouch.core.pad_model import PadModel
+    from handtouch.field.network import ElectrodeNetwork
+    from handtouch.field.surface import Surface
+
+    FloatArray = NDArray[np.float64]
 
 _WAVES = 5  # of the sheet resistance
+_M_PER_MM = 1e-3
+_OVERHANG_STEP = 1.0 / 16.0  # of a contact radius
+_STATE_STD = 0.08
+"""Standard deviation of the logarithm of a contact's current in one state of a schedule, by its force."""
+_STATE_GRID = (np.arange(12) + 0.5) / 12
+_MARGIN = 0.1  # of the sides, of typical contacts
+_MIN_SERIES_STD = 1e-6  # relative; that of the sheet resistance is in multiples of it
+_OVERHANGS, _DIRECTIONS, _SEGMENT_POINTS = 33, 8, 24
 
 
 class PadTolerances:
-    """Tolerances of one pad of n electrodes, as standard deviations.
+    """Tolerances of one pad of n electrodes, gains aside, as standard deviations.
 
-    values: nodes as `tables.read_values` needs them, over the pad in `cells` cells, each as many of the
-    forward model's as 1 / `cell_ratio`; columns are the fields of the 2 n ends of electrodes, of each state
-    of a schedule, then derivatives of the n fractions by the logarithm of the ratio of the sides, by each
-    wave of the sheet resistance, by x x and by x y. end_vectors: (2 n n,) changes of fractions by one
-    standard deviation of each end, per its field. aspect_std, wave_std: of that logarithm, and of a wave.
-    series_vectors: (n n,) changes by one standard deviation of each resistor, per its electrode's fraction;
-    series_by_sheet: (n,) standard deviations of each resistor to which one of the sheet resistance is equal.
-    tilt_std: rise of a contact's pressure to its rim, over its mean, along any direction; moment_std:
-    relative difference of its second moment along any direction from that of a round one. middle_u_m: arc
-    length from the electrode x0 to the pad's middle; size_x, size_y: relative standard deviations of its
-    sides. elongations: (cells + 1,) along x, standard deviation of what an elongated contact multiplies
-    derivatives by x x and x y with. overhangs: (k,) root mean square shift [m] of positions from an edge
-    that an elongated contact hangs over, at multiples of `overhang_step_m` from it. states: of a schedule,
-    1 without one; state_of: (n,) state in which each electrode is measured; state_std, state_std_per_a: of
-    the logarithm of a contact's current in each, by its force, and per ampere by the electrodes that it
-    sees.
+    values: `tolerance_nodes` of the pad's `ForwardTable`, over the pad in `cells` cells, each as many of the
+    forward model's as 1 / `cell_ratio`. end_vectors: (2 n n,) changes of fractions by one standard deviation
+    of each end, per its field. aspect_std, wave_std: of the logarithm of the ratio of the sides, and of a
+    wave. series_vectors: (n n,) changes by one standard deviation of each resistor, per its electrode's
+    fraction; series_by_sheet: (n,) standard deviations of each resistor to which one of the sheet resistance
+    is equal. tilt_std: rise of a contact's pressure to its rim, over its mean, along any direction;
+    moment_std: relative difference of its second moment along any direction from that of a round one.
+    middle_u_m: arc length from the electrode x0 to the pad's middle; size_x, size_y: relative standard
+    deviations of its sides. elongations: (cells + 1,) along x, standard deviation of what an elongated
+    contact multiplies derivatives by x x and x y with. overhangs: (k,) root mean square shift [m] of
+    positions from an edge that an elongated contact hangs over, at multiples of `overhang_step_m` from it.
+    states: of a schedule, 1 without one; state_of: (n,) state in which each electrode is measured; state_std,
+    state_std_per_a: of the logarithm of a contact's current in each, by its force, and per ampere by the
+    electrodes that it sees. is_shape_exact: none but gains have a tolerance.
     """
 
     def __init__(
         self,
-        values: memoryview[float],
-        cells: int,
-        cell_ratio: float,
-        end_vectors: memoryview[float],
-        aspect_std: float,
-        wave_std: float,
-        series_vectors: memoryview[float],
-        series_by_sheet: memoryview[float],
-        has_series: bool,
-        middle_u_m: float,
-        size_x: float,
-        size_y: float,
-        elongations: memoryview[float],
-        overhangs: memoryview[float],
-        overhang_step_m: float,
-        is_elongated: bool,
-        tilt_std: float,
-        moment_std: float,
-        states: int,
-        state_of: memoryview[int],
-        state_std: float,
-        state_std_per_a: float,
-        is_shape_exact: bool,
+        pad: config.Pad,
+        node: config.Node,
+        sheet: config.Sheet,
+        network: ElectrodeNetwork,
+        table: ForwardTable,
     ) -> None:
-        self.values = values
-        self.cells = cells
-        self.cell_ratio = cell_ratio
-        self.end_vectors = end_vectors
-        self.aspect_std, self.wave_std = aspect_std, wave_std
-        self.series_vectors = series_vectors
-        self.series_by_sheet, self.has_series = series_by_sheet, has_series
-        self.middle_u_m, self.size_x, self.size_y = middle_u_m, size_x, size_y
-        self.elongations, self.is_elongated = elongations, is_elongated
-        self.tilt_std, self.moment_std = tilt_std, moment_std
-        self.overhangs, self.overhang_step_m = overhangs, overhang_step_m
-        self.states, self.state_of = states, state_of
-        self.state_std, self.state_std_per_a = state_std, state_std_per_a
-        self.is_shape_exact = is_shape_exact  # none but gains have a tolerance
+        """Take the tolerances that a deployment states; `network` and `table` are the pad's."""
+        surface = pad_surface(pad)
+        self.values = view_memory(table.tolerance_nodes)
+        self.cells, self.cell_ratio = len(table.tolerance_nodes) - 1, 1 / CELLS_PER_TOLERANCE_CELL
+        end_stds = sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network)
+        end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
+        self.end_vectors = view_memory(end_vectors)
+        self.aspect_std, self.wave_std = log_aspect_std(pad, sheet), sheet.unevenness_std
+        series_ohm = np.array(pad.series_ohm)
+        series_stds = np.maximum(series_ohm_stds(pad, node), _MIN_SERIES_STD * series_ohm)
+        series_vectors = np.ascontiguousarray(series_stds[:, None] * table.series_vectors)
+        self.series_vectors, self.has_series = view_memory(series_vectors), bool(series_vectors.any())
+        self.series_by_sheet = view_memory(
+            sheet.ohm_per_square_std * series_ohm / np.where(series_stds > 0, series_stds, 1.0)
+        )
+        self.middle_u_m = surface.extent_m[0] / 2
+        self.size_x, self.size_y = relative_size_stds(pad, sheet)
+        elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
+        self.elongations, self.is_elongated = view_memory(elongations), bool(elongations.any())
+        radius_m = math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm) * _M_PER_MM
+        self.overhangs = view_memory(radius_m * overhangs(sheet.contact_elongation_std))
+        self.overhang_step_m = radius_m * _OVERHANG_STEP
+        self.tilt_std, self.moment_std = sheet.contact_tilt_std, math.sinh(sheet.contact_elongation_std)
+        self.states = pad.state_count
+        self.state_of = view_memory(
+            np.array(channel_states(pad) or [0] * len(pad.electrode_names), dtype=np.intp)
+        )
+        self.state_std = _STATE_STD if pad.switch_states else 0.0
+        self.state_std_per_a = _state_ohm_std(network) / node.drive_v
+        self.is_shape_exact = not (
+            end_vectors.any() or self.aspect_std or self.wave_std or self.has_series or self.is_elongated
+        )
 
 
 class PartKnowledge:
@@ -88,16 +120,11 @@ class PartKnowledge:
     (pads,) standard deviation of the fractions of a touch, another one each time.
     """
 
-    def __init__(
-        self,
-        axes: memoryview[float],
-        ends: memoryview[int],
-        offsets: memoryview[float],
-        touch_errors: memoryview[float],
-    ) -> None:
-        self.axes, self.ends, self.offsets, self.touch_errors = axes, ends, offsets, touch_errors
-        pads = len(touch_errors)
-        self.size, self.rows, self.parts = len(axes) // pads, len(ends) // pads, len(offsets) // pads
+    def __init__(self, model: PadModel) -> None:
+        self.axes, self.ends = view_memory(model.part_axes), view_memory(model.part_axis_ends)
+        self.offsets, self.touch_errors = view_memory(model.part_offsets), view_memory(model.touch_errors)
+        self.size, self.rows = model.part_axes.shape[1], model.part_axis_ends.shape[1]
+        self.parts = model.part_offsets.shape[1]
 
 
 class Whitening:
@@ -105,23 +132,75 @@ class Whitening:
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
     to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (8 n
     and 2 n for each state,), `changes` (p n,), `vectors` (n (n + p),), `vector` (n,): working memory.
-    `electrodes` is n of the present pad, `channels` that of the pad with most.
+    `electrodes` is n of the present pad, `channels` that of the pad with most; `states` that with most.
     """
 
-    def __init__(
-        self,
-        matrix: memoryview[float],
-        shift: memoryview[float],
-        modelled: memoryview[float],
-        fields: memoryview[float],
-        changes: memoryview[float],
-        vectors: memoryview[float],
-        vector: memoryview[float],
-        channels: int,
-    ) -> None:
-        self.matrix, self.shift, self.modelled = matrix, shift, modelled
-        self.fields, self.changes, self.vectors, self.vector = fields, changes, vectors, vector
-        self.electrodes = self.channels = channels
+    def __init__(self, channels: int, states: int) -> None:
+        n, parts = channels, part_count(channels)
+        self.electrodes = self.channels = n
+        self.matrix, self.shift = view_memory(np.zeros(n * n)), view_memory(np.zeros(n))
+        self.modelled, self.vector = view_memory(np.zeros(n)), view_memory(np.zeros(n))
+        self.fields = view_memory(np.zeros((8 + 2 * states) * n))
+        self.changes = view_memory(np.zeros(parts * n))
+        self.vectors = view_memory(np.zeros(n * (n + parts)))
+
+
+def _state_ohm_std(network: ElectrodeNetwork) -> float:
+    """Return the root mean square, over the pad, of what a contact's resistance to ground differs by between
+    the states of its schedule [ohm]; 0 without one."""
+    if not network.states:
+        return 0.0
+    x, y = np.meshgrid(network.a * _STATE_GRID, network.b * _STATE_GRID)
+    return math.sqrt(network.state_resistance(x, y).var(axis=0).mean())
+
+
+@cache
+def overhangs(elongation_std: float) -> FloatArray:
+    """Return the root mean square shift (k,) of positions found at multiples of 1 / 16 radius from an edge.
+
+    In contact radii. elongation_std: of the logarithm of length over width. The current of an elliptical
+    patch is that of the segment between its foci with the density (1 - t^2)^(1/2); what hangs over an edge
+    enters at the edge. So the centre of the current, which is the position found, is farther inside than the
+    patch's, which is equally likely anywhere on the pad, in any direction.
+    """
+    deviations = np.linspace(-3.5, 3.5, 36)
+    ratio = np.exp(elongation_std * np.abs(deviations))
+    directions = (np.arange(_DIRECTIONS) + 0.5) * np.pi / 2 / _DIRECTIONS
+    reach = np.outer(np.sqrt(ratio - 1 / ratio), np.cos(directions)).ravel()
+    angles = np.pi * np.arange(1, _SEGMENT_POINTS + 1) / (_SEGMENT_POINTS + 1)
+    points, share = np.cos(angles)[:, None], np.sin(angles) ** 2 / (np.sin(angles) ** 2).sum()
+    found_at = _OVERHANG_STEP * np.arange(_OVERHANGS)
+    centre = np.linspace(0.0, found_at.max(), 8 * _OVERHANGS)
+    square, weight = np.zeros((2, _OVERHANGS))
+    for length, likely in zip(reach, np.repeat(np.exp(-0.5 * deviations**2), _DIRECTIONS), strict=True):
+        found = share @ np.maximum(centre + length * points, 0.0)
+        shift = np.interp(found_at, found, found - centre, left=0.0)
+        # no patch of this length is found nearer than one on the edge
+        density = np.interp(found_at, found, np.gradient(centre, found), left=0.0)
+        square += likely * density * shift**2
+        weight += likely * density
+    return np.asarray(np.sqrt(square / np.maximum(weight, 1e-300)))
+
+
+def shape_error(pad: config.Pad, sheet: config.Sheet, table: ForwardTable) -> float:
+    """Return a typical standard deviation of a fraction by contacts that are elongated as stated."""
+    x, y = (nodes[::CELLS_PER_TOLERANCE_CELL, 0] for nodes in (table.nodes_x, table.nodes_y))
+    second = table.tolerance_nodes[:, :, 0, -2 * table.electrodes :].astype(np.float64)
+    square = (second**2).sum(axis=2) / table.electrodes * _elongations(sheet, pad_surface(pad), x) ** 2
+    inside = [(at > _MARGIN * at.max()) & (at < (1 - _MARGIN) * at.max()) for at in (y, x)]
+    return float(np.sqrt(np.median(square[np.ix_(*inside)])))
+
+
+def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatArray:
+    """Return half the standard deviation of the difference of variances of a contact's current, at x (k,).
+
+    Along the rectangle's axes, in squares of its unit, of elliptical patches of pressure in all directions.
+    """
+    area_m2 = (sheet.contact_radius_mm**2 + sheet.contact_radius_std_mm**2) * _M_PER_MM**2
+    difference_m2 = area_m2 / 4 * 2 * math.sinh(sheet.contact_elongation_std)
+    inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
+    along_x, along_y = surface.scales(inside, np.full(len(x), surface.b / 2))
+    return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
 
 
 def part_count(electrodes: int) -> int:
