@@ -11,8 +11,8 @@ from handtouch.config import parse
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import STANDARD_LAYOUT, ChannelField, Cycle, Slab
 from handtouch.core.stages import detect
+from handtouch.core.stages.publish import ContactEncoder
 from handtouch.core.tick import TickProcessor
-from handtouch.core.tick_messages import ContactMessageEncoder
 from handtouch.daemon.table_cache import build_pad_model
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
@@ -30,7 +30,7 @@ def main(count: int) -> None:
     model = build_pad_model(parse(TOLERANT_DEPLOYMENT + BEHAVIOUR))
     slab, cycle, tick = Slab(model.size), Cycle(PERIOD_NS, 0.6), TickProcessor(model, PERIOD_NS)
     slab.set_layout(1, (ChannelField(0, 0, 16, signed=False), *STANDARD_LAYOUT[1:]))
-    encoder = ContactMessageEncoder(model, tick, session=7)
+    encoder = ContactEncoder(model, tick, session=7)
     digest, t_ns, node_state = hashlib.sha256(), 10**9, np.zeros(model.size, np.uint8)
     tick.state.synchronous[2] = False
     for number in range(count):

@@ -12,8 +12,9 @@ from handtouch import wire
 from handtouch.config import parse
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
+from handtouch.core.stages.publish import ContactEncoder
 from handtouch.core.tick import TickProcessor
-from handtouch.core.tick_messages import ContactMessageEncoder, TickMessages
+from handtouch.core.tick_messages import TickMessages
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.pads import rotation_from_rpy
 from tests.core.conftest import TOLERANT_DEPLOYMENT
@@ -36,7 +37,7 @@ def messages(stated: str) -> tuple[wire.Contact, dict[str, NDArray[Any]]]:
         cycle.begin_cycle(t_ns)
         slab.write_pdo(0, np.rint(counts).astype("<i2").tobytes(), t_ns + 1000)
         run_tick(tick, slab, np.zeros(model.size, np.uint8), cycle)
-    encoded = ContactMessageEncoder(model, tick, session=7).encode(0, "update", t_ns, t_ns, "", False)
+    encoded = ContactEncoder(model, tick, session=7).encode(0, "update", t_ns, t_ns, "", False)
     contact = wire.decode(wire.encode(encoded))
     assert isinstance(contact, wire.Contact)
     return contact, TickMessages(model, tick).frame_columns()

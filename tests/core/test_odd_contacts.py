@@ -12,9 +12,9 @@ import pytest
 from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline
+from handtouch.core.stages.publish import ContactEncoder
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.state import TickState
-from handtouch.core.tick_messages import ContactMessageEncoder
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 from handtouch.wire.status import MAX_SILENT_PERIODS
 
@@ -67,7 +67,7 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
     pipeline = Pipeline(copy.deepcopy(bench.model), 5_000_000, 0.6, DiscardingSink())
     rng, state, columns, pad = np.random.default_rng(1), pipeline.state, pipeline.tick.columns, 1
     pipeline.model.set_calibration(pad, ActiveCalibration("default"))
-    encoder = ContactMessageEncoder(pipeline.model, pipeline.tick, session=1 << 52)
+    encoder = ContactEncoder(pipeline.model, pipeline.tick, session=1 << 52)
     for number in range(300):
         if number == 200:
             pipeline.model.set_calibration(

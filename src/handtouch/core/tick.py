@@ -15,33 +15,16 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline
 from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, VALUE_SLICES, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
-from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.shear import ShearForces, changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.publish import ContactColumns
+from handtouch.core.stages.publish import ContactColumns, published_columns
 from handtouch.core.state import TickState
-from handtouch.wire import COLUMNS, HandFrame, PadState
+from handtouch.wire import PadState
 
 FloatArray = NDArray[np.float64]
 _TOUCHED = int(PadState.TOUCHED)
-_PUBLISHED = {
-    name: at
-    for name, at in VALUE_SLICES.items()
-    if name in COLUMNS[HandFrame] and COLUMNS[HandFrame][name].codes is None
-}
-"""Values of a contact that are columns of hand frames"""
-_ENDS = np.cumsum([0, *(at.stop - at.start for at in _PUBLISHED.values())]).tolist()
-_VALUE_COLUMNS = view_memory(
-    np.array(
-        [
-            (first, at.stop - at.start, place)
-            for first, at in zip(_ENDS, _PUBLISHED.values(), strict=False)
-            for place in range(at.start, at.stop)
-        ]
-    )
-)
 
 
 @dataclass(frozen=True)
@@ -95,11 +78,7 @@ class PadColumns:
         values = state.values
         views = {name: values[:, columns] for name, columns in VALUE_SLICES.items()}
         n = len(values)
-        published = np.full(n * _ENDS[-1], np.nan, np.float32)
-        columns = {
-            name: published[n * first : n * end].reshape((n, -1)[: end - first])
-            for name, first, end in zip(_PUBLISHED, _ENDS, _ENDS[1:], strict=False)
-        }
+        memory, published = published_columns(n)
         return cls(
             state=state.pad_state,
             sample_ns=state.sample_ns,
@@ -119,8 +98,8 @@ class PadColumns:
             force_n=views["force_n"][:, 0],
             force_std_n=views["force_std_n"][:, 0],
             uncompensated_force_n=state.uncompensated_force_n,
-            published_values=published,
-            published={**columns, "total_current_a": np.zeros(n, np.float32)},
+            published_values=memory,
+            published={**published, "total_current_a": np.zeros(n, np.float32)},
             position_status=np.zeros(len(values), dtype=np.uint8),
             force_status=np.zeros(len(values), dtype=np.uint8),
         )
@@ -280,18 +259,7 @@ class TickProcessor:
             ),
             *(self.state.parts, self.contacts.saturated, self.state.noise_squared),
         )
-        self.output = ContactColumns(
-            model.size,
-            self.state.memory
-            | {
-                "position_unreliable": view_memory(model.position_unreliable),
-                "value_columns": _VALUE_COLUMNS,
-                "published": view_memory(columns.published_values),
-                "published_current_a": view_memory(columns.published["total_current_a"]),
-                "position_status": view_memory(columns.position_status),
-                "force_status": view_memory(columns.force_status),
-            },
-        )
+        self.output = ContactColumns(model, self.state, columns)
         statuses = columns.position_status, columns.force_status
         self.shear = ShearForces(model.shear_pads, self.state, *statuses, model.mounts)
         """force vectors of contacts above shear pads"""

@@ -1,15 +1,13 @@
 """Messages of each tick: contacts, hand frames and raw counts, for the topics with a subscriber.
 
-Public names: `TickMessages`, `MessageSink`, `END_REASONS`, `HandFrameEncoder`, `ContactMessageEncoder`. Bytes
+Public names: `TickMessages`, `MessageSink`, `END_REASONS`, `HandFrameEncoder`. Bytes
 that don't change from tick to tick are encoded once.
 """
 
 from __future__ import annotations
 
 import struct
-import typing
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
@@ -18,15 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.core.memory import row_count, slices_of, view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
-from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES, ContactTransforms
-from handtouch.core.stages.publish import CONDITIONS, FIELD_KINDS, INTEGERS, ContactEncoder
-from handtouch.core.stages.solve import PART_COUNT, PART_SLICES, VALUE_SLICES
-from handtouch.core.state import TickState
+from handtouch.core.stages.frames import ContactTransforms
+from handtouch.core.stages.publish import ContactEncoder
 from handtouch.core.tick import TickProcessor, TickResult
-from handtouch.wire import ContactEvent, EndReason, ForceStatus, FrameStatus, PadState, PositionStatus
+from handtouch.wire import ContactEvent, EndReason, PadState
 
 END_REASONS: dict[PadState, EndReason] = {
     PadState.STALE: "stale",
@@ -42,49 +37,7 @@ _COUNTER_KEYS = "seq", "t_ns", "tick"
 _CHANGING_KEYS = *_COUNTER_KEYS, "retained"
 _INT, _LONG = struct.Struct(">I"), struct.Struct(">Q")
 _TRUE, _FALSE = b"\xc3", b"\xc2"  # bytes of msgpack
-_EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
-_END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
 _MIN_RAW_CHANNELS = wire.COLUMNS[wire.Raw]["counts"].elements
-_KIND = {name: number for number, name in enumerate(FIELD_KINDS)}
-_CONDITION = {name: number for number, name in enumerate(CONDITIONS)}
-_NAMES: dict[str, tuple[str, ...]] = {
-    "event": _EVENTS,
-    "end_reason": _END_REASONS,
-    "position_status": tuple(status.text for status in PositionStatus),
-    "force_status": tuple(status.text for status in ForceStatus),
-    "palm_status": tuple(status.text for status in FrameStatus),
-    "base_status": tuple(status.text for status in FrameStatus),
-    "force_vector_status": tuple(status.text for status in ForceStatus),
-}
-"""Texts of a field by its number"""
-_TRUTHS, _DURATIONS = ("retained", "fresh"), ("duration_s", "age_s")
-_PAD_TEXTS = (
-    "hand", "link", "frame", "begin_threshold_n", "end_threshold_n", "calibration_id", "diagnoses",
-)  # fmt: skip
-"""Fields that change with a pad's calibration only"""
-_PLACES = {
-    **{name: (name[:4], "palm_values", at) for name, at in slices_of(CONTACT_FRAMES).items()},
-    **{name: ("located", "values", VALUE_SLICES[name]) for name in ("position_m", "normal", "pad_m")},
-    "covariance_m2": ("located", "values", VALUE_SLICES["covariance_m2"]),
-    "mount_covariance_m2": ("located", "values", VALUE_SLICES["mount_covariance_m2"]),
-    "force_std_n": ("std", "values", VALUE_SLICES["force_std_n"]),
-    "joints_age_s": ("frames", "palm_values", slices_of(CONTACT_FRAMES)["joints_age_s"]),
-    "uncompensated_force_n": ("modelled", "uncompensated_force_n", slice(0, 1)),
-    "force_vector_n": ("vector", "force_vector", slice(0, 3)),
-    "force_vector_covariance_n2": ("vector", "force_vector", slice(3, 12)),
-    "palm_force_vector_n": ("vector", "frame_force_vector", slice(0, 3)),
-    "base_force_vector_n": ("vector", "frame_force_vector", slice(3, 6)),
-}
-"""Numbers that are known under a condition: that, an array of the state, and their place in its rows. Others
-are those of the same name in VALUE_SLICES, or in the state."""
-_PART_PLACES = {
-    **{name: ("always", "parts", at) for name, at in PART_SLICES.items()},
-    **{name: (f"part_{name[:4]}", "part_frames", at) for name, at in slices_of(PART_FRAMES).items()},
-}
-"""The same of the fields of `wire.ContactPart`"""
-_PART_FIELDS = tuple(wire.ContactPart.__annotations__)
-_PART_STEPS = {"parts": PART_COUNT, "part_frames": row_count(PART_FRAMES)}
-_MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
 
 class MessageSink(Protocol):
@@ -115,7 +68,7 @@ class TickMessages:
         self._tick = tick
         self._session = session
         self._state = tick.state
-        self._contact_encoder = ContactMessageEncoder(model, tick, session)
+        self._contact_encoder = ContactEncoder(model, tick, session)
         self._end_reason: EndReason = ""  # reason for the end of all contacts, when the daemon stops
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
@@ -143,7 +96,7 @@ class TickMessages:
     def replace_model(self, model: PadModel) -> None:
         """Continue with another model of the same pads."""
         self._model = model
-        self._contact_encoder = ContactMessageEncoder(model, self._tick, self._session)
+        self._contact_encoder = ContactEncoder(model, self._tick, self._session)
 
     def end_all_contacts(self, now_ns: int, sink: MessageSink) -> None:
         """Send the end of every contact, because the daemon stops."""
@@ -313,119 +266,3 @@ class HandFrameEncoder:
         for name, source in self._sources.items():
             assert source.dtype == np.dtype(layout[name].dtype)
             self._parts[self._part_index[name]] = source.reshape(-1).view(np.uint8).data
-
-
-class ContactMessageEncoder:
-    """Encoder of the contacts of a model's pads from the arrays of a tick; `session` is the daemon's."""
-
-    def __init__(self, model: PadModel, tick: TickProcessor, session: int) -> None:
-        self._model, self._tick = model, tick
-        pack = self._pack = msgpack.Packer().pack
-        contact_fields = [field for field in fields(wire.Contact) if field.name not in ("v", "session")]
-        names = [name for field in contact_fields for name in _NAMES.get(field.name, ())]
-        keys = [pack(name) for name in (*(field.name for field in contact_fields), *_PART_FIELDS)]
-        keys[0] = pack("v") + pack(wire.SCHEMA_VERSION) + pack("session") + pack(session) + keys[0]
-        self._texts = [*keys, *map(pack, names)]
-        self._fields = len(contact_fields)
-        self._layout = _contact_layout(tick.state, contact_fields, len(keys))
-        self._topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
-        self._calibrations = list(model.calibrations)
-        self._pad_texts = [text for pad in range(model.size) for text in self._texts_of(pad)]
-        self._build_stage()
-
-    def encode(
-        self, pad: int, event: ContactEvent, sync_ns: int, now_ns: int, end_reason: EndReason, retained: bool
-    ) -> wire.EncodedMessage:
-        """Encode the contact on a pad; `sync_ns`: of the tick in which it ended."""
-        calibration = self._model.calibrations[pad]
-        if calibration is not self._calibrations[pad]:
-            self._calibrations[pad] = calibration
-            self._pad_texts[len(_PAD_TEXTS) * pad : len(_PAD_TEXTS) * (pad + 1)] = self._texts_of(pad)
-            self._build_stage()
-        size = self._stage.encode_contact(
-            pad, _EVENTS.index(event), sync_ns, now_ns, _END_REASONS.index(end_reason), retained
-        )
-        return wire.EncodedMessage(self._topics[pad], bytes(self._message[:size]))
-
-    def _texts_of(self, pad: int) -> list[bytes]:
-        """Return the packed fields of a pad that change with its calibration only, empty where absent."""
-        model, calibration = self._model, self._model.calibrations[pad]
-        values: dict[str, Any] = {
-            "hand": model.hands[pad],
-            "link": model.links[pad],
-            "frame": model.frame_links[pad],
-            "begin_threshold_n": float(model.begin_threshold_n[pad]),
-            "end_threshold_n": float(model.end_threshold_n[pad]),
-            "calibration_id": calibration.calibration_id,
-            "diagnoses": calibration.diagnoses,
-        }
-        return [
-            self._pack(name) + self._pack(values[name]) if values[name] != () else b"" for name in _PAD_TEXTS
-        ]
-
-    def _build_stage(self) -> None:
-        tick, summed = self._tick, np.zeros(9)
-        ends, pad_ends = (np.cumsum([0, *map(len, texts)]) for texts in (self._texts, self._pad_texts))
-        longest = max(np.diff(pad_ends[:: len(_PAD_TEXTS)]))
-        self._message = np.zeros(ends[-1] + longest + _MAX_VALUE_BYTES, np.uint8).data
-        arrays = {
-            "layout": view_memory(self._layout),
-            "state": view_memory(tick.state.block.view("<f8")),
-            "state_bits": view_memory(tick.state.block.view("<u8")),
-            "position_status": view_memory(tick.columns.position_status),
-            "force_status": view_memory(tick.columns.force_status),
-            "has_sheet_model": view_memory(tick.sheet_force.modelled),
-            "texts": _text_memory(self._texts),
-            "text_ends": view_memory(ends),
-            "pad_texts": _text_memory(self._pad_texts),
-            "pad_text_ends": view_memory(pad_ends),
-            "message": self._message,
-            "summed": view_memory(summed),
-            "summed_bits": view_memory(summed.view("<u8")),
-            "integers": view_memory(np.zeros(len(INTEGERS), np.int64)),
-            "conditions": view_memory(np.zeros(len(CONDITIONS), np.uint8)),
-        }
-        self._stage = ContactEncoder(
-            self._fields, len(_PAD_TEXTS), tick.state.number_of("values"), tick.state.memory | arrays
-        )
-
-
-def _contact_layout(
-    state: TickState, contact_fields: Sequence[Field[Any]], first_name: int
-) -> NDArray[np.int64]:
-    """Return the rows of `ContactEncoder.layout`, as declared in `wire.Contact` and `ContactPart`.
-
-    `first_name`: number of the first name among the texts.
-    """
-    rows: list[tuple[int, ...]] = []
-    for field in contact_fields:
-        name, is_optional = field.name, int(field.default is not MISSING)
-        if name == "parts":
-            rows.append((_KIND["parts"], 0, 1, 0, 0, 0))
-        elif name in _PAD_TEXTS:
-            rows.append((_KIND["text"], 0, is_optional, 0, 0, _PAD_TEXTS.index(name)))
-        elif name in INTEGERS:
-            kind = "seconds" if name in _DURATIONS else "truth" if name in _TRUTHS else "integer"
-            kind, default = ("name" if name in _NAMES else kind), int(field.default is True)
-            rows.append((_KIND[kind], 0, is_optional, first_name, default, INTEGERS.index(name)))
-            first_name += len(_NAMES.get(name, ()))
-        else:
-            at = VALUE_SLICES.get(name)
-            plain = "always", name if at is None else "values", slice(0, 1) if at is None else at
-            rows.append(_number_row(state, name, is_optional, _PLACES.get(name, plain)))
-    for name in _PART_FIELDS:
-        absent = 2 * (name in wire.ContactPart.__optional_keys__)
-        rows.append(_number_row(state, name, absent, _PART_PLACES[name]))
-    return np.array(rows, np.int64)
-
-
-def _number_row(state: TickState, name: str, absent: int, place: tuple[str, str, slice]) -> tuple[int, ...]:
-    condition, array, at = place
-    first, step, count = state.number_of(array), getattr(state, array)[0].size, at.stop - at.start
-    kind = {"covariance_m2": "covariance", "id": "whole"}.get(name, "numbers")
-    step = _PART_STEPS.get(array, step)
-    return _KIND[kind], _CONDITION[condition], absent, first + at.start, step, count if count > 1 else 0
-
-
-def _text_memory(texts: Sequence[bytes]) -> memoryview:
-    return memoryview(bytearray(b"".join(texts)))

@@ -1,27 +1,64 @@
 """Output of a tick's contacts: columns with statuses, NaN where there is no value, and contact messages as
 msgpack, whose bytes are those of the codec of `handtouch.wire`.
 
-Public names: `ContactColumns`, `ContactEncoder`, `FIELD_KINDS`, `CONDITIONS`, `INTEGERS`.
+Public names: `ContactColumns`, `ContactEncoder`, `published_columns`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import typing
+from collections.abc import Sequence
+from dataclasses import MISSING, Field, fields
+from typing import TYPE_CHECKING, Any
 
-from handtouch.core.memory import row_count
+import msgpack
+import numpy as np
+
+from handtouch import wire
+from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.force import BOUNDED, WIDE
-from handtouch.core.stages.frames import FRAME_ROW, PART_FRAMES
-from handtouch.core.stages.solve import PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES
+from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
+from handtouch.wire import ContactEvent, EndReason
 from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
 
-_VALUES = VALUE_COUNT
-_PAD_M, _POSITION, _NORMAL = (VALUE_SLICES[name].start for name in ("pad_m", "position_m", "normal"))
-_COVARIANCE, _MOUNT = VALUE_SLICES["covariance_m2"].start, VALUE_SLICES["mount_covariance_m2"].start
-_FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
-_ESTIMATE, _MISFIT = VALUE_SLICES["force_status"].start, VALUE_SLICES["squared_misfit"].start
-_IS_BOUND, _MAX_SQUARED_MISFIT = VALUE_SLICES["is_bound"].start, MAX_SQUARED_MISFIT
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from handtouch.core.pad_model import PadModel
+    from handtouch.core.state import TickState
+    from handtouch.core.tick import PadColumns, TickProcessor
+
+COLUMN_ROW = np.dtype(
+    [
+        ("before", "<i8"),  # published values of a pad before its column
+        ("width", "<i8"),  # of its column
+        ("place", "<i8"),  # in a row of values
+        ("added", "<i8"),  # place of the covariance of the mount that is added, -1 for none
+    ]
+)
+"""A published value of a contact"""
+FIELD_ROW = np.dtype(
+    [
+        ("kind", "<i8"),  # number in FIELD_KINDS
+        (
+            "absence",
+            "<i8",
+        ),  # when it is absent: 0 never, 1 where it is unknown, 2 where a condition isn't met
+        ("condition", "<i8"),  # of numbers: number in CONDITIONS
+        ("first", "<i8"),  # their first place in the state
+        ("step", "<i8"),  # from one pad, or one of two contacts on it, to the next
+        ("count", "<i8"),  # 0 of a single number
+        ("integer", "<i8"),  # of others: number in INTEGERS, or among the texts of a pad
+        ("default", "<i8"),
+        ("name", "<i8"),  # number of the first of their names among the texts
+    ]
+)
+"""A field of a contact message, or of one of two contacts on a pad"""
+_VALUES = row_count(VALUE_ROW)
+_PLACES_OF_VALUES = slices_of(VALUE_ROW)
+_MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _BOUNDED_ESTIMATE, _WIDE_ESTIMATE = float(BOUNDED), float(WIDE)
 _NAN, _INFINITY = float("nan"), float("inf")
 _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = map(int, PositionStatus)
@@ -29,11 +66,15 @@ _NOT_COMPUTED, _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVAL
 _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 _FRAME_VALID = int(FrameStatus.VALID)
 _END = 2  # number of the event
-_HEADER_BYTES, _NUMBER_BYTES, _ROW_COUNT, _VALUE_NUMBERS = 3, 9, 6, 3
-_FRAME_VALUES, _PART_FRAMES = row_count(FRAME_ROW), row_count(PART_FRAMES)
-_PARTS_COUNT = PARTS_COUNT
+_HEADER_BYTES, _NUMBER_BYTES = 3, 9
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9
+_PUBLISHED = {
+    name: at
+    for name, at in _PLACES_OF_VALUES.items()
+    if name in wire.COLUMNS[wire.HandFrame] and wire.COLUMNS[wire.HandFrame][name].codes is None
+}
+"""Values of a contact that are columns of hand frames"""
 
 FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "whole", "text", "parts"
 """How a field is written: four kinds from one of INTEGERS; from the memory of the state; as that, plus the
@@ -57,38 +98,91 @@ INTEGERS = (
     _SEQ, _T, _EVENT, _ID, _BEGIN, _POSITION_STATUS, _FORCE_STATUS, _REASON, _RETAINED,
     _GROUP, _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE,
 ) = range(len(INTEGERS))  # fmt: skip
+_EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
+_END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
+_NAMES: dict[str, tuple[str, ...]] = {
+    "event": _EVENTS,
+    "end_reason": _END_REASONS,
+    "position_status": tuple(status.text for status in PositionStatus),
+    "force_status": tuple(status.text for status in ForceStatus),
+    "palm_status": tuple(status.text for status in FrameStatus),
+    "base_status": tuple(status.text for status in FrameStatus),
+    "force_vector_status": tuple(status.text for status in ForceStatus),
+}
+"""Texts of a field by its number"""
+_TRUTHS, _DURATIONS = ("retained", "fresh"), ("duration_s", "age_s")
+_PAD_TEXTS = (
+    "hand", "link", "frame", "begin_threshold_n", "end_threshold_n", "calibration_id", "diagnoses",
+)  # fmt: skip
+"""Fields that change with a pad's calibration only"""
+_PLACES = {
+    **{name: (name[:4], "palm_values", at) for name, at in slices_of(CONTACT_FRAMES).items()},
+    **{name: ("located", "values", _PLACES_OF_VALUES[name]) for name in ("position_m", "normal", "pad_m")},
+    "covariance_m2": ("located", "values", _PLACES_OF_VALUES["covariance_m2"]),
+    "mount_covariance_m2": ("located", "values", _PLACES_OF_VALUES["mount_covariance_m2"]),
+    "force_std_n": ("std", "values", _PLACES_OF_VALUES["force_std_n"]),
+    "joints_age_s": ("frames", "palm_values", slices_of(CONTACT_FRAMES)["joints_age_s"]),
+    "uncompensated_force_n": ("modelled", "uncompensated_force_n", slice(0, 1)),
+    "force_vector_n": ("vector", "force_vector", slice(0, 3)),
+    "force_vector_covariance_n2": ("vector", "force_vector", slice(3, 12)),
+    "palm_force_vector_n": ("vector", "frame_force_vector", slice(0, 3)),
+    "base_force_vector_n": ("vector", "frame_force_vector", slice(3, 6)),
+}
+"""Numbers that are known under a condition: that, an array of the state, and their place in its rows. Others
+are those of the same name in _PLACES_OF_VALUES, or in the state."""
+_PART_PLACES = {
+    **{name: ("always", "parts", at) for name, at in slices_of(PART_ROW).items()},
+    **{name: (f"part_{name[:4]}", "part_frames", at) for name, at in slices_of(PART_FRAMES).items()},
+}
+"""The same of the fields of `wire.ContactPart`"""
+_PART_FIELDS = tuple(wire.ContactPart.__annotations__)
+_PART_STEPS = {"parts": row_count(PART_ROW), "part_frames": row_count(PART_FRAMES)}
+_MAX_VALUE_BYTES = 4096  # numbers and names of statuses
+
+
+def published_columns(pads: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.float32]]]:
+    """Return the memory of the published columns of n pads, and the columns in it, (n, ...)."""
+    widths = {name: at.stop - at.start for name, at in _PUBLISHED.items()}
+    memory, first, columns = np.full(pads * sum(widths.values()), np.nan, np.float32), 0, {}
+    for name, width in widths.items():
+        columns[name] = memory[first : first + pads * width].reshape((pads, width)[:width])
+        first += pads * width
+    return memory, columns
 
 
 class ContactColumns:
-    """Columns of n pads. arrays: flat memory of the arrays of `TickState` by their names.
+    """Columns of n pads: statuses and published values of contacts, of the state's last solved ones."""
 
-    Among them are also position_unreliable, (n,) of the model; value_columns, (3 m,) of each of m published
-    values the number of those before its column, that of its column, and its place in a row of values; and
-    what is written: published (n m,), published_current_a, position_status and force_status (n,).
-    """
-
-    def __init__(self, pads: int, arrays: Mapping[str, Any]) -> None:
-        self.pads, self.position_unreliable = pads, arrays["position_unreliable"]
-        self.value_columns = arrays["value_columns"]
-        self.count = len(self.value_columns) // _VALUE_NUMBERS
-        self.published, self.published_current_a = arrays["published"], arrays["published_current_a"]
-        self.total_current_a = arrays["total_current_a"]
-        self.position_status, self.force_status = arrays["position_status"], arrays["force_status"]
-        self.contact_id, self.solved, self.values = arrays["contact_id"], arrays["solved"], arrays["values"]
-        self.position_requested = arrays["position_requested"]
-        self.force_requested = arrays["force_requested"]
-        self.uncompensated_force_n = arrays["uncompensated_force_n"]
-        self.uncompensated_std_n = arrays["uncompensated_std_n"]
-        self.known, self.reliability = arrays["known"], arrays["force_reliability"]
-        self.peak_force_n = arrays["peak_force_n"]
+    def __init__(self, model: PadModel, state: TickState, columns: PadColumns) -> None:
+        memory = state.memory
+        self.pads, self.position_unreliable = model.size, view_memory(model.position_unreliable)
+        self.columns = _column_rows()
+        self.count = len(self.columns)
+        self.published = view_memory(columns.published_values)
+        self.published_current_a = view_memory(columns.published["total_current_a"])
+        self.position_status, self.force_status = (
+            view_memory(columns.position_status),
+            view_memory(columns.force_status),
+        )
+        self.values, self.contacts = memory["values"], view_rows(state.values, VALUE_ROW)
+        self.total_current_a = memory["total_current_a"]
+        self.contact_id, self.solved = memory["contact_id"], memory["solved"]
+        self.position_requested, self.force_requested = (
+            memory["position_requested"],
+            memory["force_requested"],
+        )
+        self.uncompensated_force_n = memory["uncompensated_force_n"]
+        self.uncompensated_std_n = memory["uncompensated_std_n"]
+        self.known, self.reliability = memory["known"], memory["force_reliability"]
+        self.peak_force_n = memory["peak_force_n"]
 
     def store_solved(self, pads: memoryview[int]) -> None:
         """Note that these contacts were solved; keep their forces, which compensation replaces."""
         for k in range(len(pads)):
             pad = pads[k]
             self.solved[pad] = 1
-            self.uncompensated_force_n[pad] = self.values[pad * _VALUES + _FORCE]
-            self.uncompensated_std_n[pad] = self.values[pad * _VALUES + _FORCE_STD]
+            self.uncompensated_force_n[pad] = self.contacts[pad].force_n
+            self.uncompensated_std_n[pad] = self.contacts[pad].force_std_n
 
     def publish(self) -> None:
         """Write columns and statuses of all pads, and the greatest forces of contacts.
@@ -105,53 +199,72 @@ class ContactColumns:
                     self.published[_published_index(self, pad, i)] = _NAN
 
 
+def _column_rows() -> RowArray:
+    """Return the published values as COLUMN_ROWs."""
+    mount, rows, before = _PLACES_OF_VALUES["mount_covariance_m2"].start, list[tuple[int, ...]](), 0
+    for name, at in _PUBLISHED.items():
+        width = at.stop - at.start
+        for k in range(width):
+            rows.append((before, width, at.start + k, mount + k if name == "covariance_m2" else -1))
+        before += width
+    return view_rows(np.array(rows, COLUMN_ROW), COLUMN_ROW)
+
+
 def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
     """Return the position of a pad's value i in the published columns."""
-    before = columns.value_columns[_VALUE_NUMBERS * i]
-    width = columns.value_columns[_VALUE_NUMBERS * i + 1]
-    index: int = columns.pads * before + pad * width + i - before
+    before = columns.columns[i].before
+    index: int = columns.pads * before + pad * columns.columns[i].width + i - before
     return index
 
 
-def _are_finite(values: memoryview[float], first: int, count: int) -> bool:
-    """Return True if all of these values are finite."""
-    finite = True
-    for i in range(first, first + count):
-        if not -_INFINITY < values[i] < _INFINITY:
-            finite = False
-    return finite
+def _is_finite(value: float) -> bool:
+    return -_INFINITY < value < _INFINITY
+
+
+def _is_located(contacts: RowArray, pad: int) -> bool:
+    """Return True if a contact's position is known."""
+    located = _is_finite(contacts[pad].pad_m[0]) and _is_finite(contacts[pad].pad_m[1])
+    for i in range(3):
+        if not (_is_finite(contacts[pad].position_m[i]) and _is_finite(contacts[pad].normal[i])):
+            located = False
+    return located
+
+
+def _has_mount(contacts: RowArray, pad: int) -> bool:
+    """Return True if a contact has a covariance of its pad's mount."""
+    known = True
+    for i in range(9):
+        if not _is_finite(contacts[pad].mount_covariance_m2[i]):
+            known = False
+    return known
 
 
 def _publish_contact(columns: ContactColumns, pad: int) -> None:
-    values, first = columns.values, pad * _VALUES
-    has_mount = _are_finite(values, first + _MOUNT, 9)
+    first, has_mount = pad * _VALUES, _has_mount(columns.contacts, pad)
     for i in range(columns.count):
-        at = columns.value_columns[_VALUE_NUMBERS * i + 2]
-        value = values[first + at]
-        if has_mount and _COVARIANCE <= at < _COVARIANCE + 9:
-            value += values[first + _MOUNT + at - _COVARIANCE]
-        columns.published[_published_index(columns, pad, i)] = (
-            value if -_INFINITY < value < _INFINITY else _NAN
-        )
-    located = _are_finite(values, first + _PAD_M, 2) and _are_finite(values, first + _POSITION, 6)
+        value = columns.values[first + columns.columns[i].place]
+        if has_mount and columns.columns[i].added >= 0:
+            value += columns.values[first + columns.columns[i].added]
+        columns.published[_published_index(columns, pad, i)] = value if _is_finite(value) else _NAN
+    misfit, estimate = columns.contacts[pad].squared_misfit, columns.contacts[pad].force_status
     position = _POSITION_INVALID if columns.position_requested[pad] else _NOT_COMPUTED
-    if located:
-        no_point = values[first + _MISFIT] > _MAX_SQUARED_MISFIT or values[first + _IS_BOUND] != 0.0
+    if _is_located(columns.contacts, pad):
+        no_point = misfit > _MAX_SQUARED_MISFIT or columns.contacts[pad].is_bound != 0.0
         position = _POSITION_VALID
         if no_point or columns.position_unreliable[pad]:
             position = _POSITION_UNRELIABLE
     columns.position_status[pad] = position
-    value = values[first + _FORCE]
+    value = columns.contacts[pad].force_n
     force = _NOT_COMPUTED
     if columns.force_requested[pad]:
         force = _FORCE_VALID
-        if not -_INFINITY < value < _INFINITY:
+        if not _is_finite(value):
             force = _FORCE_INVALID
-        elif values[first + _ESTIMATE] == _BOUNDED_ESTIMATE:
+        elif estimate == _BOUNDED_ESTIMATE:
             force = _FORCE_LOWER_BOUND
         elif not columns.known[pad] or columns.reliability[pad] == _EVIDENCE_MISSING:
             force = _FORCE_UNRELIABLE
-        is_odd = values[first + _ESTIMATE] == _WIDE_ESTIMATE or values[first + _MISFIT] > _MAX_SQUARED_MISFIT
+        is_odd = estimate == _WIDE_ESTIMATE or misfit > _MAX_SQUARED_MISFIT
         if force == _FORCE_VALID and is_odd:
             force = _FORCE_UNRELIABLE
     columns.force_status[pad] = force
@@ -160,43 +273,95 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
 
 
 class ContactEncoder:
-    """Encoder of contact messages. arrays: flat memory of the arrays of `TickState` by their names.
+    """Encoder of the contact messages of a model's pads from the arrays of a tick; `session` is the daemon's.
 
-    Among them are also `state`, the memory of all of them as numbers; position_status, force_status and
-    has_sheet_model, (n,) of the pads; texts, packed keys of the fields, then names, and text_ends, where each
-    begins, and the last ends; pad_texts, packed fields of the pads with keys, empty where they are absent,
-    and pad_text_ends; message, which is written; and working memory: summed (9,), integers and conditions.
-    state_bits, summed_bits: the numbers of state and summed as integers of their bits.
-
-    layout: (6 m,), of each field its number in FIELD_KINDS; that in CONDITIONS; 0 if it is always present, 1
-    if it is absent where it is unknown, 2 where its condition isn't met; of numbers their first place in the
-    state, the step from one pad to the next, and their count, 0 of a single number; of others the first of
-    their names, their default, and their number in INTEGERS. Behind the `fields` of a contact are those of
-    one of two contacts on a pad, with the step from one to the next. first_value: place in the state of the
-    first row of values.
+    fields: FIELD_ROWs, `field_count` of a contact, then those of one of two contacts on a pad. state: memory
+    of all arrays as numbers, state_bits as integers of their bits. texts: packed keys of the fields, then
+    names; text_ends: where each begins, and the last ends. pad_texts, pad_text_ends: the same of packed
+    fields of the pads with keys, empty where they are absent. `message` is written; summed (9,), integers
+    and conditions: working memory.
     """
 
-    def __init__(self, fields: int, pad_text_count: int, first_value: int, arrays: Mapping[str, Any]) -> None:
-        self.row_count, self.pad_text_count, self.first_value = fields, pad_text_count, first_value
-        self.layout, self.state, self.summed = arrays["layout"], arrays["state"], arrays["summed"]
-        self.integers, self.conditions = arrays["integers"], arrays["conditions"]
-        self.part_rows = len(self.layout) // _ROW_COUNT - fields
-        self.position_status, self.force_status = arrays["position_status"], arrays["force_status"]
-        self.has_sheet_model = arrays["has_sheet_model"]
-        self.texts, self.text_ends = arrays["texts"], arrays["text_ends"]
-        self.pad_texts, self.pad_text_ends = arrays["pad_texts"], arrays["pad_text_ends"]
-        self.state_bits, self.summed_bits = arrays["state_bits"], arrays["summed_bits"]
-        self.message = arrays["message"]
-        self.contact_seq, self.contact_id = arrays["contact_seq"], arrays["contact_id"]
-        self.sample_ns, self.begin_ns = arrays["sample_ns"], arrays["begin_ns"]
-        self.group_id = arrays["group_id"]
-        self.silent_ns, self.synchronous = arrays["silent_ns"], arrays["synchronous"]
-        self.max_sample_period_ns = arrays["max_sample_period_ns"]
-        self.palm_requested, self.base_requested = arrays["palm_requested"], arrays["base_requested"]
-        self.palm_status, self.base_status = arrays["palm_status"], arrays["base_status"]
-        self.vector_status, self.parts = arrays["force_vector_status"], arrays["parts"]
-        self.part_frames = arrays["part_frames"]
-        self.written = self.fields = 0
+    def __init__(self, model: PadModel, tick: TickProcessor, session: int) -> None:
+        state = tick.state
+        memory = state.memory
+        self.model, self.pack = model, msgpack.Packer().pack
+        pack = self.pack
+        contact_fields = [field for field in fields(wire.Contact) if field.name not in ("v", "session")]
+        names = [name for field in contact_fields for name in _NAMES.get(field.name, ())]
+        keys = [pack(name) for name in (*(field.name for field in contact_fields), *_PART_FIELDS)]
+        keys[0] = pack("v") + pack(wire.SCHEMA_VERSION) + pack("session") + pack(session) + keys[0]
+        self.fields = _field_rows(state, contact_fields, len(keys))
+        self.field_count, self.row_count = len(contact_fields), len(keys)
+        self.topics = [f"contact/{hand}/{link}" for hand, link in zip(model.hands, model.links, strict=True)]
+        self.calibrations = list(model.calibrations)
+        self.own_texts = [text for pad in range(model.size) for text in self.texts_of(pad)]
+        texts = [*keys, *map(pack, names)]
+        self.texts, self.text_ends, self.pad_text_count = (
+            _text_memory(texts),
+            _ends_of(texts),
+            len(_PAD_TEXTS),
+        )
+        self.state, self.state_bits = (
+            view_memory(state.block.view("<f8")),
+            view_memory(state.block.view("<u8")),
+        )
+        summed = np.zeros(9)
+        self.summed, self.summed_bits = view_memory(summed), view_memory(summed.view("<u8"))
+        self.integers = view_memory(np.zeros(len(INTEGERS), np.int64))
+        self.conditions = view_memory(np.zeros(len(CONDITIONS), np.uint8))
+        self.contacts, self.parts = view_rows(state.values, VALUE_ROW), view_rows(state.parts, PART_ROW)
+        frames = view_rows(state.part_frames, PART_FRAMES)
+        self.parts_palm, self.parts_base = frames["palm"], frames["base"]
+        self.position_status = view_memory(tick.columns.position_status)
+        self.force_status = view_memory(tick.columns.force_status)
+        self.has_sheet_model = view_memory(tick.sheet_force.modelled)
+        self.contact_seq, self.contact_id = memory["contact_seq"], memory["contact_id"]
+        self.sample_ns, self.begin_ns = memory["sample_ns"], memory["begin_ns"]
+        self.group_id = memory["group_id"]
+        self.silent_ns, self.synchronous = memory["silent_ns"], memory["synchronous"]
+        self.max_sample_period_ns = memory["max_sample_period_ns"]
+        self.palm_requested, self.base_requested = memory["palm_requested"], memory["base_requested"]
+        self.palm_status, self.base_status = memory["palm_status"], memory["base_status"]
+        self.vector_status = memory["force_vector_status"]
+        self.written = self.written_fields = 0
+        self.set_pad_texts()
+
+    def encode(
+        self, pad: int, event: ContactEvent, sync_ns: int, now_ns: int, end_reason: EndReason, retained: bool
+    ) -> wire.EncodedMessage:
+        """Encode the contact on a pad; `sync_ns`: of the tick in which it ended."""
+        calibration = self.model.calibrations[pad]
+        if calibration is not self.calibrations[pad]:
+            self.calibrations[pad] = calibration
+            self.own_texts[len(_PAD_TEXTS) * pad : len(_PAD_TEXTS) * (pad + 1)] = self.texts_of(pad)
+            self.set_pad_texts()
+        size = self.encode_contact(
+            pad, _EVENTS.index(event), sync_ns, now_ns, _END_REASONS.index(end_reason), retained
+        )
+        return wire.EncodedMessage(self.topics[pad], bytes(self.buffer[:size]))
+
+    def texts_of(self, pad: int) -> list[bytes]:
+        """Return the packed fields of a pad that change with its calibration only, empty where absent."""
+        model, calibration, pack = self.model, self.model.calibrations[pad], self.pack
+        values: dict[str, Any] = {
+            "hand": model.hands[pad],
+            "link": model.links[pad],
+            "frame": model.frame_links[pad],
+            "begin_threshold_n": float(model.begin_threshold_n[pad]),
+            "end_threshold_n": float(model.end_threshold_n[pad]),
+            "calibration_id": calibration.calibration_id,
+            "diagnoses": calibration.diagnoses,
+        }
+        return [pack(name) + pack(values[name]) if values[name] != () else b"" for name in _PAD_TEXTS]
+
+    def set_pad_texts(self) -> None:
+        """Take the pads' own texts over."""
+        self.pad_texts, self.pad_text_ends = _text_memory(self.own_texts), _ends_of(self.own_texts)
+        longest = max(np.diff(np.asarray(self.pad_text_ends)[:: len(_PAD_TEXTS)]))
+        size = np.asarray(self.text_ends).max() + longest + _MAX_VALUE_BYTES
+        self.buffer = np.zeros(size, np.uint8).data
+        self.message = self.buffer
 
     def encode_contact(
         self, pad: int, event: int, sync_ns: int, now_ns: int, end_reason: int, retained: bool
@@ -214,11 +379,67 @@ class ContactEncoder:
         self.integers[_REASON], self.integers[_RETAINED] = end_reason, retained
         self.integers[_FRESH] = _is_fresh(self, pad)
         _read_statuses(self, pad)
-        self.written, self.fields = _HEADER_BYTES, 2  # v and session are with the first key
-        for row in range(self.row_count):
+        self.written, self.written_fields = _HEADER_BYTES, 2  # v and session are with the first key
+        for row in range(self.field_count):
             _write_field(self, row, pad, pad)
-        self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.fields
+        self.message[0], self.message[1], self.message[2] = 0xDE, 0, self.written_fields
         return self.written
+
+
+def _field_rows(state: TickState, contact_fields: Sequence[Field[Any]], first_name: int) -> RowArray:
+    """Return the FIELD_ROWs of the fields of `wire.Contact`, as declared, then of `wire.ContactPart`.
+
+    `first_name`: number of the first name among the texts.
+    """
+    rows: list[tuple[int, ...]] = []
+    for field in contact_fields:
+        name, absence = field.name, int(field.default is not MISSING)
+        if name == "parts":
+            rows.append(_row(kind=_PARTS, absence=1))
+        elif name in _PAD_TEXTS:
+            rows.append(_row(kind=_TEXT, absence=absence, integer=_PAD_TEXTS.index(name)))
+        elif name in INTEGERS:
+            kind = _SECONDS if name in _DURATIONS else _TRUTH if name in _TRUTHS else _INTEGER
+            if name in _NAMES:
+                kind = _NAME
+            integer, default = INTEGERS.index(name), int(field.default is True)
+            rows.append(_row(kind=kind, absence=absence, integer=integer, default=default, name=first_name))
+            first_name += len(_NAMES.get(name, ()))
+        else:
+            at = _PLACES_OF_VALUES.get(name)
+            plain = "always", name if at is None else "values", slice(0, 1) if at is None else at
+            rows.append(_number_row(state, name, absence, _PLACES.get(name, plain)))
+    for name in _PART_FIELDS:
+        absence = 2 * (name in wire.ContactPart.__optional_keys__)
+        rows.append(_number_row(state, name, absence, _PART_PLACES[name]))
+    return view_rows(np.array(rows, FIELD_ROW), FIELD_ROW)
+
+
+def _number_row(state: TickState, name: str, absence: int, place: tuple[str, str, slice]) -> tuple[int, ...]:
+    condition, array, at = place
+    count = at.stop - at.start
+    return _row(
+        kind=_SUM if name == "covariance_m2" else _WHOLE if name == "id" else _NUMBERS,
+        absence=absence,
+        condition=CONDITIONS.index(condition),
+        first=state.number_of(array) + at.start,
+        step=_PART_STEPS.get(array, getattr(state, array)[0].size),
+        count=count if count > 1 else 0,
+    )
+
+
+def _row(**values: int) -> tuple[int, ...]:
+    """Return a FIELD_ROW of these values, 0 where none is given."""
+    return tuple(values.get(name, 0) for name in FIELD_ROW.names or ())
+
+
+def _text_memory(texts: Sequence[bytes]) -> memoryview:
+    return memoryview(bytearray(b"".join(texts)))
+
+
+def _ends_of(texts: Sequence[bytes]) -> memoryview[int]:
+    """Return where each text begins, and the last ends."""
+    return view_memory(np.cumsum([0, *map(len, texts)]))
 
 
 def _is_fresh(encoder: ContactEncoder, pad: int) -> bool:
@@ -229,7 +450,6 @@ def _is_fresh(encoder: ContactEncoder, pad: int) -> bool:
 
 def _read_statuses(encoder: ContactEncoder, pad: int) -> None:
     """Set group, statuses and conditions of a contact; in no frame where none is requested."""
-    first = encoder.first_value + pad * _VALUES
     in_frames = encoder.palm_requested[pad] or encoder.base_requested[pad]
     force = encoder.force_status[pad]
     encoder.integers[_POSITION_STATUS], encoder.integers[_FORCE_STATUS] = encoder.position_status[pad], force
@@ -238,11 +458,7 @@ def _read_statuses(encoder: ContactEncoder, pad: int) -> None:
     encoder.integers[_BASE_STATUS] = encoder.base_status[pad] if in_frames else _NOT_COMPUTED
     encoder.integers[_VECTOR_STATUS] = encoder.vector_status[pad]
     encoder.conditions[_ALWAYS], encoder.conditions[_FRAMES] = True, in_frames
-    encoder.conditions[_LOCATED] = (
-        _are_known(encoder, first + _POSITION, 3)
-        and _are_known(encoder, first + _NORMAL, 3)
-        and _are_known(encoder, first + _PAD_M, 2)
-    )
+    encoder.conditions[_LOCATED] = _is_located(encoder.contacts, pad)
     encoder.conditions[_STD] = force in (_FORCE_VALID, _FORCE_UNRELIABLE)
     encoder.conditions[_PALM] = encoder.integers[_PALM_STATUS] == _FRAME_VALID
     encoder.conditions[_BASE] = encoder.integers[_BASE_STATUS] == _FRAME_VALID
@@ -254,26 +470,25 @@ def _are_known(encoder: ContactEncoder, first: int, count: int) -> bool:
     """Return True if all of these numbers of the state are finite."""
     finite = True
     for i in range(first, first + count):
-        if not -_INFINITY < encoder.state[i] < _INFINITY:
+        if not _is_finite(encoder.state[i]):
             finite = False
     return finite
 
 
 def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> None:
     """Write a field of the layout with its key, unless it is absent; `number` counts its places."""
-    at = row * _ROW_COUNT
-    kind, is_optional = encoder.layout[at], encoder.layout[at + 2]
+    kind = encoder.fields[row].kind
     if kind in (_NUMBERS, _SUM, _WHOLE):
         _write_numbers(encoder, row, pad, number)
     elif kind == _TEXT:
-        _write_pad_text(encoder, pad * encoder.pad_text_count + encoder.layout[at + 5])
+        _write_pad_text(encoder, pad * encoder.pad_text_count + encoder.fields[row].integer)
     elif kind == _PARTS:
-        if encoder.parts[_PARTS_COUNT * pad] == encoder.parts[_PARTS_COUNT * pad]:
+        if encoder.parts[2 * pad].position_m[0] == encoder.parts[2 * pad].position_m[0]:
             _write_key(encoder, row)
             _write_parts(encoder, pad)
     else:
-        value = encoder.integers[encoder.layout[at + 5]]
-        if is_optional and value == encoder.layout[at + 4]:
+        value = encoder.integers[encoder.fields[row].integer]
+        if encoder.fields[row].absence and value == encoder.fields[row].default:
             return
         _write_key(encoder, row)
         if kind == _INTEGER:
@@ -283,7 +498,7 @@ def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> No
             _write_bits(encoder.message, encoder.written, encoder.summed_bits[0])
             encoder.written += _NUMBER_BYTES
         elif kind == _NAME:
-            name = encoder.layout[at + 3] + value
+            name = encoder.fields[row].name + value
             _write_text(encoder, encoder.text_ends[name], encoder.text_ends[name + 1])
         else:
             _write_byte(encoder, 0xC3 if value else 0xC2)
@@ -291,24 +506,22 @@ def _write_field(encoder: ContactEncoder, row: int, pad: int, number: int) -> No
 
 def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> None:
     """Write an array of at most 15 numbers, or one; nil or absent where they are unknown."""
-    at = row * _ROW_COUNT
-    absent, count = encoder.layout[at + 2], encoder.layout[at + 5]
-    first, size = encoder.layout[at + 3] + number * encoder.layout[at + 4], count if count else 1
-    is_met = encoder.conditions[encoder.layout[at + 1]]
+    absent, count = encoder.fields[row].absence, encoder.fields[row].count
+    first, size = encoder.fields[row].first + number * encoder.fields[row].step, count if count else 1
+    is_met = encoder.conditions[encoder.fields[row].condition]
     if not is_met and absent:
         return
     is_known = is_met and _are_known(encoder, first, size)
-    is_sum = encoder.layout[at] == _SUM
+    is_sum = encoder.fields[row].kind == _SUM
     if is_known and is_sum:
-        _sum_covariance(encoder, first, encoder.first_value + pad * _VALUES + _MOUNT)
-        is_known = _are_finite(encoder.summed, 0, size)
+        is_known = _sum_covariance(encoder, first, pad)
     if not is_known and absent == 1:
         return
     _write_key(encoder, row)
     if not is_known:
         _write_byte(encoder, 0xC0)
         return
-    if encoder.layout[at] == _WHOLE:
+    if encoder.fields[row].kind == _WHOLE:
         _write_integer(encoder, int(encoder.state[first]))
         return
     if count:
@@ -320,31 +533,34 @@ def _write_numbers(encoder: ContactEncoder, row: int, pad: int, number: int) -> 
     encoder.written = end
 
 
-def _sum_covariance(encoder: ContactEncoder, first: int, mount: int) -> None:
-    """Set `summed` to a covariance on the pad, plus that of its mount, if the pad's contact has one."""
-    known = _are_known(encoder, mount, 9)
+def _sum_covariance(encoder: ContactEncoder, first: int, pad: int) -> bool:
+    """Set `summed` to a covariance on the pad, plus that of its mount, if the pad's contact has one; return
+    True if it is finite."""
+    has_mount, finite = _has_mount(encoder.contacts, pad), True
     for i in range(9):
         encoder.summed[i] = encoder.state[first + i]
-        if known:
-            encoder.summed[i] += encoder.state[mount + i]
+        if has_mount:
+            encoder.summed[i] += encoder.contacts[pad].mount_covariance_m2[i]
+        if not _is_finite(encoder.summed[i]):
+            finite = False
+    return finite
 
 
 def _write_parts(encoder: ContactEncoder, pad: int) -> None:
     """Write the two contacts of a pad as maps."""
-    fields = encoder.fields
+    fields = encoder.written_fields
     in_palm, in_base = encoder.palm_status[pad] == _FRAME_VALID, encoder.base_status[pad] == _FRAME_VALID
     _write_byte(encoder, 0x92)
     for number in range(2 * pad, 2 * pad + 2):
-        first = number * _PART_FRAMES
-        palm, base = encoder.part_frames[first], encoder.part_frames[first + _FRAME_VALUES]
-        encoder.conditions[_PART_PALM] = in_palm and -_INFINITY < palm < _INFINITY
-        encoder.conditions[_PART_BASE] = in_base and -_INFINITY < base < _INFINITY
-        encoder.fields, header = 0, encoder.written
+        palm, base = encoder.parts_palm[number].position_m[0], encoder.parts_base[number].position_m[0]
+        encoder.conditions[_PART_PALM] = in_palm and _is_finite(palm)
+        encoder.conditions[_PART_BASE] = in_base and _is_finite(base)
+        encoder.written_fields, header = 0, encoder.written
         _write_byte(encoder, 0x80)
-        for row in range(encoder.row_count, encoder.row_count + encoder.part_rows):
+        for row in range(encoder.field_count, encoder.row_count):
             _write_field(encoder, row, pad, number)
-        encoder.message[header] = 0x80 + encoder.fields
-    encoder.fields = fields
+        encoder.message[header] = 0x80 + encoder.written_fields
+    encoder.written_fields = fields
 
 
 def _write_text(encoder: ContactEncoder, begin: int, end: int) -> None:
@@ -358,13 +574,13 @@ def _copy(message: memoryview[int], at: int, texts: memoryview[int], begin: int,
 
 
 def _write_key(encoder: ContactEncoder, row: int) -> None:
-    encoder.fields += 1
+    encoder.written_fields += 1
     _write_text(encoder, encoder.text_ends[row], encoder.text_ends[row + 1])
 
 
 def _write_pad_text(encoder: ContactEncoder, row: int) -> None:
     if encoder.pad_text_ends[row + 1] > encoder.pad_text_ends[row]:
-        encoder.fields += 1
+        encoder.written_fields += 1
     begin, end = encoder.pad_text_ends[row], encoder.pad_text_ends[row + 1]
     _copy(encoder.message, encoder.written, encoder.pad_texts, begin, end)
     encoder.written += end - begin

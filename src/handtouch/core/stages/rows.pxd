@@ -47,3 +47,20 @@ cdef packed struct FrameRow:
     double[3] position_m
     double[3] normal
     double[9] covariance_m2
+
+cdef packed struct ColumnRow:
+    long long before
+    long long width
+    long long place
+    long long added
+
+cdef packed struct FieldRow:
+    long long kind
+    long long absence
+    long long condition
+    long long first
+    long long step
+    long long count
+    long long integer
+    long long default
+    long long name
