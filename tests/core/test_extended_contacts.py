@@ -13,7 +13,7 @@ from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ForceEstimateStatus
-from handtouch.simulate.contact_patch import discs
+from handtouch.simulate.contact_patch import PROFILES, discs
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.solved_contact import PatchNodes
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -86,6 +86,33 @@ def test_the_force_of_two_patches_is_within_its_interval(total_n: float) -> None
     assert found["squared_misfit"][0, 0] > 9.0
     assert found["force_status"][0, 0] == ForceEstimateStatus.VALID
     assert abs(found["force_n"][0, 0] - total_n) < 1.96 * found["force_std_n"][0, 0]
+
+
+def shares_of_true_forces(tilt_std: float) -> list[float]:
+    """Return the share of forces within 1.96 deviations for each profile of pressure; the law is exact."""
+    exact = dict.fromkeys(("ohm_per_square_std", "contact_ohm_std", "alpha_std"), 0.0)
+    stated = deployed(contact_tilt_std=tilt_std, max_force_n=20.0, **exact)
+    hand, model, shares = virtual_hand(stated), build_pad_model(stated), []
+    rng, count = np.random.default_rng(6), 60
+    for number in range(len(PROFILES)):
+        patch = discs(rng.normal(2.5e-3, 5e-4, count).clip(1e-3))
+        patch[2], patch[3] = rng.uniform(0, np.pi, count), number
+        force_n = np.exp(rng.uniform(0.0, np.log(20.0), count))
+        position = rng.uniform(0.15, 0.85, (2, count))
+        currents, _ = hand.solve_contacts(np.zeros(count, np.intp), position, patch, force_n)
+        found = solve(model, currents)
+        fitted = found["force_status"][:, 0] == ForceEstimateStatus.VALID
+        off_n = found["force_n"][:, 0] - force_n
+        true = np.where(fitted, np.abs(off_n) < 1.96 * found["force_std_n"][:, 0], off_n < 0)
+        shares.append(float(true.mean()))
+    return shares
+
+
+def test_firm_forces_hold_however_their_pressure_is_distributed() -> None:
+    known, unknown = (shares_of_true_forces(tilt_std) for tilt_std in (0.3, 0.0))
+    assert np.mean(known) > 0.91
+    assert min(known) > 0.85
+    assert min(unknown) < 0.8
 
 
 def test_two_patches_at_the_sheets_limit_give_a_bound_below_their_force() -> None:

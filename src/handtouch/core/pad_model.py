@@ -49,6 +49,10 @@ _SHEET_TOLERANCES = {
 }
 
 
+_UNEVEN_FACTOR = 1 / 3
+"""Relative standard deviation of a layer's resistance over `contact_tilt_std`: even, Hertz's, tilted, annular
+and two-spot pressures, weighted alike, have 0.1 where the layer dominates and twice that where the sheet
+does."""
 _UNLIMITED_FORCE_N = 1e3  # force of a sheet without max_force_n: its current is the sheet's maximum
 _MIN_RADIUS_RATIO = 0.3  # least radius of a contact, relative to the stated one
 _DEAD_WEIGHT = 1e-6  # weight of a dead electrode, whose readings are left out
@@ -315,6 +319,7 @@ class PadModel:
             *(log_x2, power, 2 - 2 * alpha, log_radius, radius_variance, log_sheet, self._drive_v[pad]),
             *(log_x2 * (power - 2 * growth) + log_reference_n, *np.array(law.covariance)[np.triu_indices(3)]),
             *(log_max_x2, float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0, growth),
+            _UNEVEN_FACTOR * sheet.contact_tilt_std,
         )
 
     def stage_tolerances(self) -> list[PadTolerances]:

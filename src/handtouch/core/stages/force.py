@@ -37,7 +37,8 @@ FITTED, BOUNDED, NOT_ESTIMATED, WIDE = 0, 1, 2, 4
 _FITTED, _BOUNDED, _NOT_ESTIMATED, _WIDE = FITTED, BOUNDED, NOT_ESTIMATED, WIDE
 _LOG_X2, _POWER, _BY_RADIUS, _LOG_RADIUS, _RADIUS_VARIANCE = 0, 1, 2, 3, 4
 _LOG_SHEET, _DRIVE, _LOG_REFERENCE, _COVARIANCE, _MAX_LOG_X2, _MIN_FACTOR, _GROWTH = 5, 6, 7, 8, 14, 15, 16
-LAW_PARAMETERS = 17
+_UNEVEN = 17
+LAW_PARAMETERS = 18
 _BOUND_SIGMA, _MAX_CURRENT_FRACTION = contact_law.BOUND_SIGMA, contact_law.MAX_CURRENT_FRACTION
 _MIN_LOG_SPREADING_RATIO = math.log(contact_law.MIN_SPREADING_RATIO)
 _MIN_CURRENT_A, _MIN_LEFT = 1e-200, 1e-12
@@ -136,8 +137,9 @@ class PadLaw:
     radius [m] at 1 N, and its variance; ln of the sheet resistance; drive voltage; what ln of the pressure
     over the reference is less at ln x^2 = 0; upper triangle of the calibrated law's covariance (ln specific
     resistance, alpha, ln sheet resistance); ln x^2 with its stack factor at the greatest force, infinite and
-    0 where that is unknown; and the derivative of ln radius by ln x^2, 0 of a constant radius. series: (n n,)
-    quadratic form of the series resistors [ohm]; has_series: any isn't 0.
+    0 where that is unknown; the derivative of ln radius by ln x^2, 0 of a constant radius; and the relative
+    standard deviation of the stack factor by pressures that aren't even, where the layer dominates. series:
+    (n n,) quadratic form of the series resistors [ohm]; has_series: any isn't 0.
     """
 
     def __init__(self, parameters: memoryview[float], series: memoryview[float], has_series: bool) -> None:
@@ -336,9 +338,8 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     growth = law.parameters[_GROWTH]
     if growth > 0.0:
         _set_radius(result, law.parameters[_LOG_RADIUS] + growth * (log_x2 - law.parameters[_LOG_X2]))
-    bend = result.bend
-    if bend > 0.0:
-        bend *= max(1.0 - 2.0 * factor / density, 0.0)
+    share = max(1.0 - 2.0 * factor / density, 0.0)
+    bend = result.bend * share
     width = result.high - result.low + bend
     total = factor + 0.5 * (result.high + result.low - bend)
     by_radius, radius_variance = law.parameters[_BY_RADIUS], law.parameters[_RADIUS_VARIANCE]
@@ -352,6 +353,8 @@ def _evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float
     chord = (result.left + total + 4.0 * math.sqrt(result.left * total)) / 6.0
     width *= total / chord
     variance = result.variance * total * total + 0.25 * width * width
+    uneven = law.parameters[_UNEVEN] * (1.0 + share) * factor
+    variance += uneven * uneven
     variance += radius_variance * (first * first + 0.5 * second * second * radius_variance)
     variance += law.parameters[_COVARIANCE] * slope * slope
     variance += law.parameters[_COVARIANCE + 3] * by_alpha * by_alpha

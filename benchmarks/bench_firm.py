@@ -1,0 +1,161 @@
+"""Firm presses up to `max_force_n`, anywhere on the pads of the shipped file, through the daemon's pipeline.
+
+Hands of the world `default` ([worlds](../worlds.md)), seeds of the reporting family, described with the
+tolerances of their builder, at a SYNC of 10 ms. Presses of 0.3 s with ramps of 0.1 s, places uniform from 2 %
+of a side inside the edges, forces log-uniform, patches of the world's sizes, shapes and profiles; contacts
+are read in both ramps and twice in between, where forces and positions are judged. *Ended or unknown*:
+without a contact at one of these, with another contact than at the others, or without a number for position
+or force. A force is *true* if the 95 % interval of a valid one holds it, or a lower bound is below it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from concurrent.futures import ProcessPoolExecutor
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.bench_contacts import WORLD
+from benchmarks.hand_touches import position_error, serve
+from benchmarks.page import Limit, Report, options, progress
+from benchmarks.scores import ClusterShare
+from handtouch import wire
+from handtouch.config import load, shipped
+from handtouch.daemon.table_cache import build_pad_model
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.truth import GroundTruth
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import Family
+
+FloatArray = NDArray[np.float64]
+BANDS_N = (1.0, 3.3, 5.0, 10.0, 20.0)
+"""Limits of the rows; the last is the shipped file's `max_force_n`."""
+PERIOD_MS, REST_S, STEP_S, PRESS_S, RAMP_S = 10.0, 1.0, 0.4, 0.3, 0.1
+READ_S = (0.05, 0.12, 0.18, 0.25)
+JUDGED = 2
+VALID, BOUND = "valid", "lower_bound"
+IN_REGION = 5.991  # chi-squared of two degrees of freedom, 95 %
+COLUMNS = ("force_n", "lost", "located", "inside", "force valid", "bound", "true")
+
+
+def draw_presses(links: list[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
+    """Return `count` presses of each pad, one after the other."""
+    rng = np.random.default_rng((seed, 17))
+    ends = np.log([BANDS_N[0], BANDS_N[-1]])
+    return tuple(
+        ScenarioTouch(
+            link=link,
+            from_s=REST_S + number * STEP_S,
+            duration_s=PRESS_S,
+            ramp_s=RAMP_S,
+            path=(tuple(rng.uniform(0.02, 0.98, 2)),),
+            force_n=(float(np.exp(rng.uniform(*ends))),),
+        )
+        for number in range(count)
+        for link in links
+    )
+
+
+def play(task: tuple[int, int, Family]) -> tuple[FloatArray, NDArray[np.str_]]:
+    """Return columns (n, COLUMNS) of the presses of a hand, and their pads: number, presses of each pad."""
+    number, count, family = task
+    drawn = WORLD.draw(family.seed(number))
+    deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
+    daemon = deployment.daemon.model_copy(update={"sync_period_ms": PERIOD_MS})
+    deployment = deployment.model_copy(update={"daemon": daemon})
+    model = build_pad_model(deployment)
+    hand = VirtualHand(deployment, Scenario(touch=draw_presses(model.links, count, drawn.seed)), drawn)
+    times_s = 1e-3 * PERIOD_MS * np.arange(round((REST_S + count * STEP_S) / (1e-3 * PERIOD_MS)))
+    counts = np.stack([hand.counts(row, times_s) for row in range(model.size)], axis=1)
+    ticks = {
+        round((REST_S + k * STEP_S + at_s) / (1e-3 * PERIOD_MS)): len(READ_S) * k + step
+        for k in range(count)
+        for step, at_s in enumerate(READ_S)
+    }
+    contacts = serve(model, deployment, counts, ticks)
+    rows, pads = [], []
+    for tick, key in ticks.items():
+        if key % len(READ_S) != JUDGED:
+            continue
+        for truth in hand.truth(float(times_s[tick])):
+            found = [contacts.get((key - JUDGED + step, truth.link)) for step in range(len(READ_S))]
+            rows.append(columns_of(found, truth))
+            pads.append(f"{number}/{truth.link}")
+    return np.array(rows, dtype=np.float64), np.array(pads)
+
+
+def columns_of(found: list[wire.Contact | None], truth: GroundTruth) -> tuple[float, ...]:
+    """Return the COLUMNS of a press: its contact at READ_S, and its truth at the judged one."""
+    judged = found[JUDGED]
+    known = [one for one in found if one and one.position_m is not None and one.force_n is not None]
+    lost = len(known) < len(found) or len({one.id for one in known}) > 1
+    error, covariance = position_error(judged, truth)
+    located = bool(np.isfinite(error).all())
+    inside = located and error @ np.linalg.solve(covariance, error) < IN_REGION
+    valid = judged is not None and judged.force_status == VALID and judged.force_std_n is not None
+    bound = judged is not None and judged.force_status == BOUND
+    true = False
+    if judged is not None and judged.force_n is not None:
+        off_n = judged.force_n - truth.force_n
+        true = abs(off_n) < 1.96 * (judged.force_std_n or 0.0) if valid else bound and off_n < 0
+    return truth.force_n, lost, located, inside, valid, bound, true
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--hands", type=int, default=5)
+    parser.add_argument("--presses", type=int, default=134, help="of each pad of a hand")
+    parser.add_argument("--tuning", action="store_true", help="seeds of the tuning family; keeps no page")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    asked = parser.parse_args()
+    if asked.quick:
+        asked.hands, asked.presses = 1, 4
+    family = Family.TUNING if asked.tuning else Family.REPORTING
+    tasks = [(number, asked.presses, family) for number in range(asked.hands)]
+    with ProcessPoolExecutor(asked.processes) as pool:
+        made = []
+        for task, result in zip(tasks, pool.map(play, tasks), strict=True):
+            progress(f"hand {task[0] + 1}")
+            made.append(result)
+    values, pads = (np.concatenate(parts) for parts in zip(*made, strict=True))
+    column = dict(zip(COLUMNS, values.T, strict=True))
+    limits = [*itertools.pairwise(BANDS_N), (BANDS_N[0], BANDS_N[-1])]
+    rows = []
+    for low, high in limits:
+        of_row = (column["force_n"] >= 0.99 * low) & (column["force_n"] <= high)
+        located = of_row & (column["located"] > 0)
+        stated = of_row & (column["force valid"] + column["bound"] > 0)
+        rows.append(
+            {
+                "force": f"{low:g} to {high:g} N",
+                "presses": int(of_row.sum()),
+                "ended or unknown": int(column["lost"][of_row].sum()),
+                "position valid, %": 100 * column["located"][of_row].mean(),
+                "valid positions in 95 %": ClusterShare.of_mask(column["inside"][located] > 0, pads[located]),
+                "force valid, %": 100 * column["force valid"][of_row].mean(),
+                "lower bound, %": 100 * column["bound"][of_row].mean(),
+                "interval or bound true": ClusterShare.of_mask(column["true"][stated] > 0, pads[stated]),
+            }
+        )
+    report = Report(asked.quick or asked.tuning, hands=asked.hands, presses_of_a_pad=asked.presses)
+    report.table("Presses", rows)
+    report.limits += [
+        Limit("presses whose contact ended or lost a number", rows[-1]["ended or unknown"], 0),
+        Limit(
+            "interval or bound true",
+            100 * rows[-1]["interval or bound true"].value,
+            95.0,
+            "%",
+            at_least=True,
+        ),
+    ]
+    report.keep()
+
+
+if __name__ == "__main__":
+    main()
