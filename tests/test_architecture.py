@@ -6,6 +6,7 @@ import ast
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -36,10 +37,17 @@ def _name(path: Path) -> str:
 FILES = {_name(path): path for path in SOURCE.rglob("*.py")}
 
 
+@cache
+def _statements(module: str) -> list[ast.AST]:
+    """Return the imports and classes of a module, at any depth."""
+    nodes = ast.walk(ast.parse(FILES[module].read_text()))
+    return [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom | ast.ClassDef)]
+
+
 def _imports(module: str) -> Iterator[tuple[str, int]]:
     """Yield every module that a module imports, at any depth, with its line."""
     path = FILES[module]
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in _statements(module):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -167,8 +175,8 @@ def test_the_simulator_uses_none_of_the_estimators(graph: Graph) -> None:
 
 def test_class_names_are_unique() -> None:
     places: dict[str, list[str]] = defaultdict(list)
-    for module, path in FILES.items():
-        for node in ast.walk(ast.parse(path.read_text())):
+    for module in FILES:
+        for node in _statements(module):
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(f"{module}:{node.lineno}")
     assert not {name: where for name, where in places.items() if len(where) > 1}

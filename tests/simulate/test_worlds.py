@@ -40,25 +40,30 @@ FloatArray = NDArray[np.float64]
 Draw = Callable[[DrawnWorld, config.Deployment], Any]
 
 
+@cache
+def drawn_pad(world: str, seed: int, pad: config.Pad) -> Any:
+    return WORLDS[world].draw(seed).pad("right", pad)
+
+
+def second_pad(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
+    return drawn_pad(drawn.world.name, drawn.seed, deployment.hands[0].pads[1])
+
+
 def pad_value(name: str) -> Draw:
     """Return the draw of a property of the second pad, less what its table contributes."""
-
-    def draw(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
-        return getattr(drawn.pad("right", deployment.hands[0].pads[1]), name)
-
-    return draw
+    return lambda drawn, deployment: getattr(second_pad(drawn, deployment), name)
 
 
 def resistor_ratio(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
     pad = deployment.hands[0].pads[1]
     used = np.array(pad.series_ohm) > 0
-    resistors = np.array(drawn.pad("right", pad).series_ohm) - drawn.lead_ohm("right/round")
+    resistors = np.array(second_pad(drawn, deployment).series_ohm) - drawn.lead_ohm("right/round")
     return (resistors[used] / np.array(pad.series_ohm)[used]).tolist()
 
 
 def gap_offset(drawn: DrawnWorld, deployment: config.Deployment) -> Any:
     pad = deployment.hands[0].pads[1]
-    hidden = drawn.pad("right", pad)
+    hidden = second_pad(drawn, deployment)
     return (np.array(hidden.gap_before_mm + hidden.gap_after_mm) - pad.gap_mm).tolist()
 
 
@@ -83,8 +88,13 @@ def shear_value(name: str) -> Draw:
 CHANNEL_ERRORS = ("common_noise_counts", "hum_counts", "crosstalk", "nonlinearity_counts")
 
 
+@cache
+def channel_errors(world: str, seed: int) -> Any:
+    return WORLDS[world].draw(seed).channel_errors("right/round")
+
+
 def channel_value(name: str) -> Draw:
-    return lambda drawn, _: getattr(drawn.channel_errors("right/round"), name)
+    return lambda drawn, _: getattr(channel_errors(drawn.world.name, drawn.seed), name)
 
 
 DRAWS: dict[str, Draw] = {
