@@ -98,7 +98,7 @@ addresses = st.builds(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(
     present=st.dictionaries(addresses, st.booleans(), min_size=1, max_size=12),
     delays_s=st.lists(st.floats(0.0001, 0.02), min_size=1, max_size=4),
@@ -123,7 +123,7 @@ def test_any_set_of_nodes_is_found_completely_and_gets_unique_ids(
     assert master.scan() == []
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(present=st.dictionaries(addresses, st.booleans(), min_size=1, max_size=6))
 def test_a_scan_changes_no_node(present: dict[LssAddress, bool]) -> None:
     slaves = [LssSlave(each, compares=compares) for each, compares in present.items()]
