@@ -33,19 +33,18 @@ HANDTOUCH := $(if $(UV),$(UV) pip install --quiet --python $(BIN)/python --no-de
 # with progress, before pip builds the package in silence; without a compiler it says what is missing
 COMPILE := $(BIN)/python src/handtouch/core/build.py || test "$(CI)" != true
 
+# $(call INSTALL,LOCK): the build tools, which compile while the packages of the lock are installed, then handtouch
+INSTALL = $(LOCKED) -r locks/build.lock && { { $(COMPILE); } & compiling=$$!; $(LOCKED) -r locks/$(1).lock; installed=$$?; \
+	wait $$compiling && test $$installed = 0; } && { $(HANDTOUCH); }
+
 $(VENV)/.run: pyproject.toml locks/run.lock locks/build.lock | $(BIN)/python
 	@echo "installing packages into $(VENV) ..."
-	@$(LOCKED) -r locks/build.lock
-	@{ $(COMPILE); } & compiling=$$!; $(LOCKED) -r locks/run.lock; installed=$$?; \
-		wait $$compiling && exit $$installed
-	@$(HANDTOUCH)
+	@$(call INSTALL,run)
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml locks/dev.lock | $(BIN)/python
+$(VENV)/.dev: pyproject.toml locks/dev.lock locks/build.lock | $(BIN)/python
 	@echo "installing packages and tools into $(VENV) ..."
-	@$(LOCKED) -r locks/dev.lock
-	@$(COMPILE)
-	@$(HANDTOUCH)
+	@$(call INSTALL,dev)
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 # sources that Cython compiles; a run without a compiler is slower, and says so
