@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from handtouch.core.sheet_force import (
 )
 from handtouch.core.state import TickState
 from handtouch.sheet import BankPrior
-from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
+from handtouch.simulate.sheet_physics import SheetLaw, SheetStates
 from handtouch.simulate.worlds import SHEET_KINDS, WORLDS, DrawnWorld, Family, SheetKind
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +132,7 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int, kind_of_use: ty
     """
     rng = np.random.default_rng((seed, 9))
     laws = [law for some in sheets for law in some.laws]
-    states = [SheetState.fresh(law) for law in laws]
+    states, one = [SheetStates(law) for law in laws], np.zeros(1, np.intp)
     behaviours = [stated_behaviour(some) for some in sheets for _ in some.laws]
     held = TickState.empty(len(laws))
     compensation = SheetForceCompensation(behaviours, round(DT_S * 1e9), held)
@@ -154,10 +153,9 @@ def score_use(sheets: Sequence[Sheets], hours: float, seed: int, kind_of_use: ty
             load = use.loads_n() if is_work else none
             t_ns += round(dt_s * 1e9)
             gone_s += dt_s
-            step = partial(advance, dt_s=dt_s, is_excited=True, warmer_k=0.0)
             smooth = np.zeros(len(laws))
             for pad in np.flatnonzero((load > 0) | loaded).tolist():  # an unloaded sheet doesn't change
-                smooth[pad] = step(laws[pad], states[pad], load_n=float(load[pad]))
+                smooth[pad] = states[pad].advance(one, dt_s, load[pad])[0]
             loaded = load > 0
             flicker = 1 + noise_std / np.sqrt(np.maximum(smooth, 1e-3)) * rng.normal(size=len(laws))
             apparent = np.maximum(gains * press * smooth * flicker, 0.0)

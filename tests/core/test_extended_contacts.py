@@ -57,7 +57,7 @@ def elongated_at_an_edge(elongation_std: float, count: int) -> tuple[FloatArray,
     position = np.stack([rng.uniform(3e-4, 2e-3, count) / length_m, rng.uniform(0.3, 0.7, count)])
     patch = discs(np.full(count, 2.5e-3))
     patch[1], patch[2] = np.exp(ELONGATION_STD * np.abs(rng.normal(size=count))), rng.uniform(0, np.pi, count)
-    single, _ = hand.solve_contacts(np.zeros(count, np.intp), position, patch, np.ones(count))
+    single = hand.solve_contacts(np.zeros(count, np.intp), position, patch, np.ones(count))
     model = build_pad_model(stated)
     found = solve(model, single)
     shape = hand.virtual_pads[0].shape

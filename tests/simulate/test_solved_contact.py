@@ -103,7 +103,7 @@ def solve_reduced(
     shape, bank = plane
     position = np.array([[place_mm[0] / LENGTH_MM], [place_mm[1] / WIDTH_MM]])
     nodes = PatchNodes.of_patches(shape, position, patch.column(np.array([force_n])))
-    log_radius, shares, _ = look_up_nodes(bank, np.zeros(1, np.intp), nodes)
+    log_radius, shares = look_up_nodes(bank, np.zeros(1, np.intp), nodes)
     one = np.zeros(1, np.intp)
     ohm, mean, _ = solve_patches(nodes, log_radius, shares, one, np.array([force_n]), OHM, LAYER)
     centre = nodes.centres(shape, position)[:, 0] * (LENGTH_MM, WIDTH_MM)

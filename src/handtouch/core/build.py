@@ -105,9 +105,10 @@ def _translate(compiled: ModuleType, names: Sequence[str], source: Path, folder:
     cython = [sys.executable, "-c", compiled.CYTHON]
     if compiled.SHARED in names:
         _run([*cython, f"--generate-shared={folder}/{compiled.SHARED}.c"], source)
-    if stages := [f"handtouch/core/stages/{name}.py" for name in names if name != compiled.SHARED]:
+    modules = [compiled.module_name(name) for name in names if name != compiled.SHARED]
+    if stages := [f"{name.replace('.', '/')}.py" for name in modules]:
         options = [f"-X{key}={value}" for key, value in compiled.DIRECTIVES.items()]
-        shared = f"--shared=handtouch.core.stages.{compiled.SHARED}"
+        shared = f"--shared={compiled.module_name(compiled.SHARED)}"
         _run([*cython, *options, shared, "-o", str(folder), *stages], source)
 
 

@@ -1,11 +1,12 @@
 """Compiled stages: which files hold them, and whether they are used.
 
-Public names: `STAGES`, `SHARED`, `MODULES`, `source_hash`, `compiled_file`, `this_platform`,
-`CompiledFinder`, `Compilation`.
+Public names: `STAGES`, `SIMULATOR_STAGES`, `SHARED`, `MODULES`, `module_name`, `source_hash`,
+`compiled_file`, `this_platform`, `CompiledFinder`, `Compilation`.
 
-The modules of `handtouch.core.stages` are plain Python that Cython compiles as it stands. A compiled module
-carries the hash of its sources in its file's name; one of other sources isn't loaded, and Python runs all
-stages from their sources instead, with the same results to the last bit and some fifty times slower.
+The modules of `handtouch.core.stages` and `handtouch.simulate.stages` are plain Python that Cython compiles
+as it stands. A compiled module carries the hash of its sources in its file's name; one of other sources isn't
+loaded, and Python runs all stages from their sources instead, with the same results to the last bit and some
+fifty times slower.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import sys
 import sysconfig
 from collections.abc import Sequence
 from functools import cache
@@ -28,9 +30,11 @@ STAGES = (
     *("kinematics", "groups", "frames", "publish", "shear", "evidence"),
 )
 """Modules of `handtouch.core.stages`, lowest first."""
+SIMULATOR_STAGES = ("patches", "histories")
+"""Modules of `handtouch.simulate.stages`."""
 SHARED = "_shared"
 """Module with what Cython needs for memoryviews, instead of in each stage: that halves the time to compile"""
-MODULES = (SHARED, *STAGES)
+MODULES = (SHARED, *STAGES, *SIMULATOR_STAGES)
 DIRECTIVES = {
     "language_level": "3",
     "infer_types": "True",  # locals are C numbers, not objects
@@ -52,9 +56,9 @@ LIMITED_API = ("-DCYTHON_LIMITED_API=1", "-DPy_LIMITED_API=0x030B0000")
 """The stable ABI of Python 3.11: one file for this and all later versions."""
 DISABLE_VARIABLE = "HANDTOUCH_UNCOMPILED"
 """Environment variable that makes Python run the sources, for debugging."""
-_PACKAGE = "handtouch.core.stages"
-_FOLDER = Path(__file__).parent / "stages"
-_CIMPORT = re.compile(rf"^from {_PACKAGE}(?:\.(\w+) cimport .*| cimport (.*))$", re.MULTILINE)
+_ROOT = Path(__file__).parents[2]
+_FOLDER = Path(__file__).parent / "stages" / "_compiled"
+_CIMPORT = re.compile(r"^from handtouch\.core\.stages(?:\.(\w+) cimport .*| cimport (.*))$", re.MULTILINE)
 
 
 class Compilation(NamedTuple):
@@ -75,9 +79,14 @@ class Compilation(NamedTuple):
         missing = [name for name in MODULES if not compiled_file(name).exists()]
         if not missing:
             return cls(True, "")
-        if any((_FOLDER / "_compiled").glob("*.so")):
+        if any(_FOLDER.glob("*.so")):
             return cls(False, "the compiled modules are of other sources")
         return cls(False, "they were never compiled on this machine")
+
+
+def module_name(stage: str) -> str:
+    """Return the name of a stage's module, with its package."""
+    return f"handtouch.{'simulate' if stage in SIMULATOR_STAGES else 'core'}.stages.{stage}"
 
 
 @cache
@@ -88,14 +97,18 @@ def source_hash(stage: str) -> str:
         return digest.hexdigest()[:16]
     declarations, waiting = {stage}, [stage]
     while waiting:
-        text = (_FOLDER / f"{waiting.pop()}.pxd").read_text()
+        text = _source(waiting.pop(), "pxd").read_text()
         used = {name for found in _CIMPORT.findall(text) for name in re.findall(r"\w+", found[0] or found[1])}
         waiting += used - declarations
         declarations |= used
-    digest.update((_FOLDER / f"{stage}.py").read_bytes())
+    digest.update(_source(stage, "py").read_bytes())
     for name in sorted(declarations):
-        digest.update((_FOLDER / f"{name}.pxd").read_bytes())
+        digest.update(_source(name, "pxd").read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _source(stage: str, suffix: str) -> Path:
+    return (_ROOT / module_name(stage).replace(".", "/")).with_suffix(f".{suffix}")
 
 
 def this_platform() -> str:
@@ -109,14 +122,20 @@ def compiled_file(stage: str, platform: str = "") -> Path:
     `platform` : this machine's by default
     """
     platform = platform or this_platform()
-    return _FOLDER / "_compiled" / f"{stage}-{source_hash(stage)}-{platform}.abi3.so"
+    return _FOLDER / f"{stage}-{source_hash(stage)}-{platform}.abi3.so"
 
 
 class CompiledFinder(MetaPathFinder):
     """Finds the compiled modules of the stages where all are there; else leaves it to the sources."""
 
+    @classmethod
+    def install(cls) -> None:
+        """Load compiled stages in this process from now on, if all are there."""
+        if Compilation.current().compiled and not any(isinstance(finder, cls) for finder in sys.meta_path):
+            sys.meta_path.insert(0, cls())
+
     def __init__(self) -> None:
-        self._files = {f"{_PACKAGE}.{name}": str(compiled_file(name)) for name in MODULES}
+        self._files = {module_name(name): str(compiled_file(name)) for name in MODULES}
 
     def find_spec(
         self,

@@ -76,7 +76,16 @@ class ElectronicsDrift:
         """Return random walks (keys, n) that start at 0 and never exceed the rate."""
         if not rate:
             return np.zeros((len(keys), len(times_s)))
+        if len(keys) == len(times_s) == 1:
+            return rate * _single_walk(int(keys[0]), float(times_s[0]))
         return np.asarray(rate * (noise.random_walk(keys, times_s) - _walk_at_start(keys.tobytes())))
+
+
+@lru_cache(maxsize=64)
+def _single_walk(key: int, t_s: float) -> FloatArray:
+    """Return a walk (1, 1) at a time, which zeros, gains and sheets of a sample ask for."""
+    keys = np.array([key], np.uint64)
+    return np.asarray(noise.random_walk(keys, t_s) - _walk_at_start(keys.tobytes()))
 
 
 @lru_cache(maxsize=1024)

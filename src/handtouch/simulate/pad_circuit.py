@@ -219,7 +219,7 @@ class PadCircuit:
             spreading_ohm = self._local_ohm(position) / (2 * math.pi) * spreading
             return values[:-1].T[number], contact.leak_ohm[rows] + spreading_ohm[number]
         nodes = PatchNodes.of_patches(self.shape, position, columns[2:])
-        log_radius, shares, _ = look_up_nodes(bank, sheet, nodes)
+        log_radius, shares = look_up_nodes(bank, sheet, nodes)
         local_ohm = np.broadcast_to(self._local_ohm(position), len(sheet))[number]
         ohm, mean, _ = solve_patches(
             nodes, log_radius, shares, number, contact.force_n[rows], local_ohm, layer_of(self.sheet)

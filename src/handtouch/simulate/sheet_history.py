@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate import noise
-from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
+from handtouch.simulate.sheet_physics import SheetLaw, SheetStates
 
 FloatArray = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ class SimulatedSheetHistory:
         times = np.concatenate([force_times_s, (settling_times_s[:, None] + _SETTLING_KNOTS_S).ravel()])
         self._knots = np.unique(np.ceil(times / _MIN_KNOT_INTERVAL_S) * _MIN_KNOT_INTERVAL_S)
         self._excitation_switches: list[tuple[float, bool]] = []
-        self._checkpoints: list[tuple[float, SheetState]] = [(0.0, SheetState.fresh(self._law))]
+        self._checkpoints: list[tuple[float, SheetStates]] = [(0.0, SheetStates(self._law))]
         self._segments: list[tuple[FloatArray, FloatArray]] = []  # after each checkpoint: times, ratios
         self._force_ratios: tuple[FloatArray, FloatArray] | None = None
 
@@ -61,7 +61,7 @@ class SimulatedSheetHistory:
         keep = max(int(np.searchsorted([time_s for time_s, _ in self._checkpoints], t_s, side="right")), 1)
         del self._checkpoints[keep:], self._segments[keep - 1 :]
         if t_s < self._checkpoints[0][0]:
-            self._checkpoints, self._segments = [(0.0, SheetState.fresh(self._law))], []
+            self._checkpoints, self._segments = [(0.0, SheetStates(self._law))], []
         self._excitation_switches.append((t_s, on))
         self._force_ratios = None
 
@@ -73,7 +73,7 @@ class SimulatedSheetHistory:
         if len(times_s) == 0:
             return np.ones(0)
         if times_s.min() < self._checkpoints[0][0]:  # before the oldest checkpoint: start again
-            self._checkpoints, self._segments = [(0.0, SheetState.fresh(self._law))], []
+            self._checkpoints, self._segments = [(0.0, SheetStates(self._law))], []
         self._extend_to(float(times_s.max()))
         if self._force_ratios is None:
             whole = (np.concatenate(parts) for parts in zip(*self._segments, strict=True))
@@ -97,18 +97,9 @@ class SimulatedSheetHistory:
         end = max(until_s, reached) + _LOOK_AHEAD_S
         times = self._knots_between(reached, end)
         force_n, rise_k = self._total_force_n(self._scenario_time_s(times)), self._temperature_rise_k(times)
-        excited = self._excitation_on(times)
-        state = state.copy()
-        apparent = np.empty(len(times))
-        steps = zip(
-            np.diff(times, prepend=reached).round(6).tolist(),
-            force_n.tolist(),
-            excited.tolist(),
-            rise_k.tolist(),
-            strict=True,
-        )
-        for i, (dt_s, load_n, is_excited, warmer_k) in enumerate(steps):
-            apparent[i] = advance(self._law, state, dt_s, load_n, is_excited, warmer_k)
+        state, steps_s = state.copy(), np.diff(times, prepend=reached).round(6)
+        one = np.zeros(len(times), np.intp)
+        apparent = state.advance(one, steps_s, force_n, self._excitation_on(times), rise_k)
         pressed = force_n > 0
         self._segments.append((times[pressed], apparent[pressed] / force_n[pressed]))
         self._checkpoints.append((end, state))

@@ -1,7 +1,7 @@
 """Behaviour of a simulated sheet under load: hysteresis, adaptation, creep, temperature, fluctuation.
 
 Public names: `SheetLaw` (parameters of one sheet) with its parts `ElementCreep`, `PowerCreep`, `BackForces`;
-`SheetState`, `advance`.
+`SheetStates`.
 
 It has more kinds than the compensation in `handtouch.sheet` and uses nothing of it. Parts act in one order:
 load -> + thermal preload -> hysteresis -> adaptation -> creep -> thermal gain -> fluctuation -> apparent.
@@ -12,16 +12,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gamma
 
-from handtouch.simulate.preisach import Everett, PreisachState
+from handtouch.simulate.preisach import HomogeneousLoops, Loops, PlayLoops
+from handtouch.simulate.stages.histories import HistoryStage
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
+_MAX_TURNS: Final = 128
+"""Turning points of its load that a sheet remembers, of 64 nested cycles; the smallest are forgotten first"""
 _SHORTEST_S, _LONGEST_S = 1e-5, 1e9
 _ELEMENTS_PER_DECADE = 3
 
@@ -113,7 +117,7 @@ class SheetLaw:
 
     adaptation: BackForces = BackForces()
     creep: CreepLaw = ElementCreep()
-    hysteresis: Everett | None = None
+    hysteresis: Loops | None = None
     gain_per_k: float = 0.0
     preload_n_per_k: float = 0.0
     press_std: float = 0.0
@@ -123,66 +127,94 @@ class SheetLaw:
     noise_time_s: float = 0.05
 
 
-@dataclass
-class SheetState:
-    """State of one sheet."""
+class SheetStates:
+    """States of `count` sheets of one law, that were never pressed."""
 
-    loops: PreisachState
-    back_n: FloatArray
-    creep_n: FloatArray
-    peak_n: float = 0.0
-    """Greatest load of the present press; 0 between presses."""
-    flow_s: float = 0.0
-    """Total time of current flow."""
-
-    @classmethod
-    def fresh(cls, law: SheetLaw) -> SheetState:
-        """Return the state of a sheet that was never pressed."""
-        return cls(
-            PreisachState(), np.zeros(len(law.adaptation.shares)), np.zeros(len(law.creep.elements[0]))
+    def __init__(self, law: SheetLaw, count: int = 1) -> None:
+        self._law, self._count = law, count
+        self._arrays = {
+            "turning_n": np.zeros((count, _MAX_TURNS)),  # of the load: 0, maximum, minimum, ... and present
+            "turns": np.ones(count, np.intp),  # of these points that still count
+            "back_n": np.zeros((count, len(law.adaptation.shares))),
+            "creep_n": np.zeros((count, len(law.creep.elements[0]))),
+            "peak_n": np.zeros(count),  # greatest load of the present press; 0 between presses
+            "flow_s": np.zeros(count),  # total time of current flow
+        }
+        self._stage = HistoryStage(
+            _law_numbers(law), {name: array.reshape(-1).data for name, array in self._arrays.items()}
         )
 
-    def copy(self) -> SheetState:
+    def reset(self, sheet: int) -> None:
+        """Replace a sheet by one that was never pressed."""
+        for name, array in self._arrays.items():
+            array[sheet] = name == "turns"
+
+    def copy(self) -> SheetStates:
         """Return an independent copy."""
-        return SheetState(
-            self.loops.copy(), self.back_n.copy(), self.creep_n.copy(), self.peak_n, self.flow_s
-        )
+        copied = SheetStates(self._law, self._count)
+        for name, array in self._arrays.items():
+            copied._arrays[name][:] = array
+        return copied
+
+    def __deepcopy__(self, memo: object) -> SheetStates:
+        """Return an independent copy."""
+        return self.copy()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _states_of, (self._law, self._count, self._arrays)
+
+    def advance(
+        self,
+        sheets: IntArray,
+        dt_s: ArrayLike,
+        load_n: ArrayLike,
+        is_excited: ArrayLike = True,
+        warmer_k: ArrayLike = 0.0,
+    ) -> FloatArray:
+        """Return the apparent loads (k,) [N] at the ends of intervals (k,), one after another, under constant
+        loads >= 0, each of one of the `sheets` (k,); update their states.
+
+        They have no fluctuation. An interval is exact for any `dt_s` under which current either flows
+        throughout or doesn't flow.
+        """
+        count = len(sheets)
+        columns = np.empty((3, count))
+        columns[0], columns[1], columns[2] = dt_s, load_n, warmer_k
+        excited, apparent_n = np.empty(count, np.uint8), np.empty(count)
+        excited[:] = is_excited
+        dt, load, warmer = (column.data for column in columns)
+        self._stage.advance(sheets.data, dt, load, excited.data, warmer, apparent_n.data)
+        return apparent_n
 
 
-def advance(
-    law: SheetLaw, state: SheetState, dt_s: float, load_n: float, is_excited: bool, warmer_k: float
-) -> float:
-    """Return the apparent load [N] at the end of an interval under a constant load >= 0; update `state`.
-
-    It has no fluctuation. The step is exact for any `dt_s` under which current either flows throughout or
-    doesn't flow.
-    """
-    load = max(load_n + law.preload_n_per_k * warmer_k, 0.0)
-    if law.hysteresis:
-        load = state.loops.apply(law.hysteresis, load)
-    effective = _adapt(law.adaptation, state, dt_s, load, is_excited)
-    weights, times = law.creep.elements
-    state.creep_n += (effective - state.creep_n) * -np.expm1(-dt_s / times)
-    np.minimum(state.creep_n, effective, out=state.creep_n)  # a release is abrupt
-    reading = law.creep.instant * effective + float(weights @ state.creep_n)
-    return reading * (1 + law.gain_per_k * warmer_k)
+def _states_of(law: SheetLaw, count: int, arrays: dict[str, NDArray[Any]]) -> SheetStates:
+    states = SheetStates(law, count)
+    for name, array in arrays.items():
+        states._arrays[name][:] = array
+    return states
 
 
-def _adapt(law: BackForces, state: SheetState, dt_s: float, load_n: float, is_excited: bool) -> float:
-    """Return the effective load [N] at the end of the interval."""
-    back_n = sum(state.back_n.tolist())
-    flows = is_excited and load_n - back_n > law.threshold_n
-    shares, times = law.elements
-    if flows:
-        speed = 1 + (state.flow_s + dt_s / 2) / law.fatigue_s  # integrated over dt
-        state.back_n += (shares * load_n - state.back_n) * -np.expm1(-dt_s * speed / times)
-        state.flow_s += dt_s
-        back_n = sum(state.back_n.tolist())
-    if not is_excited:
-        state.back_n *= math.exp(-dt_s / law.recovery_s)
-        back_n = sum(state.back_n.tolist())
-    is_pressed = load_n > law.threshold_n
-    if not is_pressed and 0 < state.peak_n < law.wipe_fraction * back_n:
-        state.back_n[:] = 0.0
-    state.peak_n = max(state.peak_n, load_n) if is_pressed else 0.0
-    return load_n - back_n if flows else 0.0
+def _law_numbers(law: SheetLaw) -> dict[str, Any]:
+    """Return the law as `HistoryStage` takes it."""
+    loops, back = law.hysteresis, law.adaptation
+    plays = loops if isinstance(loops, PlayLoops) else None
+    weights, times_s = law.creep.elements
+    shares, back_times_s = back.elements
+    return {
+        "preload_n_per_k": law.preload_n_per_k,
+        "gain_per_k": law.gain_per_k,
+        "instant": law.creep.instant,
+        "threshold_n": back.threshold_n,
+        "recovery_s": back.recovery_s,
+        "fatigue_s": back.fatigue_s,
+        "wipe_fraction": back.wipe_fraction,
+        "has_loops": loops is not None,
+        "exponent": loops.exponent if isinstance(loops, HomogeneousLoops) else 0.0,
+        "linear": plays.linear if plays else 1.0,
+        "play_weight": plays.weight if plays else 0.0,
+        "plays_n": np.array(plays.thresholds_n if plays else []).data,
+        "weights": weights.data,
+        "times_s": times_s.data,
+        "shares": shares.data,
+        "back_times_s": back_times_s.data,
+    }

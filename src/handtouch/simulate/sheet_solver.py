@@ -29,6 +29,7 @@ from scipy.linalg import eigh, lu_factor, lu_solve
 
 from handtouch.simulate.pad_geometry import SheetMetric, SimulatedSurface
 from handtouch.simulate.spectral_elements import ElementAxis, lobatto_nodes
+from handtouch.simulate.stages.patches import NodeTables
 
 FloatArray = NDArray[np.float64]
 
@@ -170,52 +171,54 @@ def mutual_resistance(shape: SimulatedSurface, gaps: ElectrodeGaps) -> MutualRes
 
 
 class SheetMapBank:
-    """Maps of many sheets, evaluated together."""
+    """Maps of many sheets, evaluated together.
+
+    w is the number of electrodes of the sheet with most; shares of the others' missing ones are 0. `sheet`
+    (k,) are indices of sheets, `s` and `phi` (k,) fractions of their sides.
+    """
 
     def __init__(self, sheets: Sequence[SheetMaps]) -> None:
-        rows = max(len(sheet.table) for sheet in sheets)
-        self._shape = sheets[0].table.shape[1:]
-        tables = np.zeros((len(sheets), *self._shape, rows))
+        self._rows = max(len(sheet.table) for sheet in sheets)
+        shape = sheets[0].table.shape[1:]
+        tables = np.zeros((len(sheets), *shape, self._rows))
         for table, sheet in zip(tables, sheets, strict=True):
             table[..., : len(sheet.table) - 1] = np.moveaxis(sheet.table[:-1], 0, -1)
             table[..., -1] = sheet.table[-1]
-        self._table = tables.reshape(-1, rows)
-        """(sheets * nodes along s * nodes along phi, rows)"""
+        arrays = tables, _SHARE_BREAKS, _VALUES, _SLOPES, np.zeros((4, _TABLE_DEGREE + 1))
+        flat, *others = (array.reshape(-1).data for array in arrays)
+        self._tables = NodeTables(flat, shape[0], self._rows, *others)
 
     def look_up(
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return values (w + 1, k) of `SheetMaps.table` and their derivatives (w + 1, 2, k) by s and phi.
+        """Return values (w + 1, k) of `SheetMaps.table` and their derivatives (w + 1, 2, k) by s and phi;
+        positions are clipped to `EDGE_INSET_FRACTION` from each side."""
+        slopes = np.empty((self._rows, 2, len(sheet)))
+        return self._read(sheet, s, phi, slopes), slopes
 
-        w is the number of electrodes of the sheet with most; shares of the others' missing ones are 0.
+    def values_anywhere(self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray) -> FloatArray:
+        """Return values (w + 1, k) at positions on the whole pad: beyond the maps' ends, shares and the
+        conformal radius itself continue as straight lines, the latter down to 1e-3 of its value there."""
+        values = self._read(sheet, s, phi, np.empty(0))
+        least, greatest = EDGE_INSET_FRACTION, 1 - EDGE_INSET_FRACTION
+        beyond = np.flatnonzero((np.minimum(s, phi) < least) | (np.maximum(s, phi) > greatest))
+        if len(beyond):
+            position = np.stack([s[beyond], phi[beyond]])
+            _, slopes = self.look_up(sheet[beyond], *position)
+            change = (slopes * (position - np.clip(position, least, greatest))).sum(axis=1)
+            values[:-1, beyond] += change[:-1]
+            values[-1, beyond] += np.log(np.maximum(1 + change[-1], 1e-3))
+        return values
 
-        `sheet` (k,) are indices of sheets, `s` and `phi` (k,) fractions of their sides, clipped to
-        `EDGE_INSET_FRACTION` from each side.
-        """
-        row, of_s, slope_s = _basis(_SHARE_BREAKS, s)
-        column, of_phi, slope_phi = _basis(_SHARE_BREAKS, phi)
-        first = sheet * (self._shape[0] * self._shape[1])
-        node = (first[:, None] + row * self._shape[1])[:, :, None] + column[:, None, :]
-        patch = self._table.take(node.reshape(len(sheet), -1), axis=0)  # (k, (degree + 1)^2, w + 1)
-        weights = np.empty((len(sheet), 3, *node.shape[1:]))
-        np.multiply(of_s[:, :, None], of_phi[:, None, :], out=weights[:, 0])
-        np.multiply(slope_s[:, :, None], of_phi[:, None, :], out=weights[:, 1])
-        np.multiply(of_s[:, :, None], slope_phi[:, None, :], out=weights[:, 2])
-        found = (weights.reshape(len(sheet), 3, -1) @ patch).transpose(2, 1, 0)
-        return found[:, 0].copy(), found[:, 1:].copy()
-
-    def look_up_anywhere(
-        self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return `look_up` of positions on the whole pad: beyond the maps' ends, shares and the conformal
-        radius itself continue as straight lines, the latter down to 1e-3 of its value there."""
-        values, slopes = self.look_up(sheet, s, phi)
-        position = np.stack([s, phi])
-        beyond = position - np.clip(position, EDGE_INSET_FRACTION, 1 - EDGE_INSET_FRACTION)
-        change = (slopes * beyond).sum(axis=1)
-        values[:-1] += change[:-1]
-        values[-1] += np.log(np.maximum(1 + change[-1], 1e-3))
-        return values, slopes
+    def _read(
+        self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray, slopes: FloatArray
+    ) -> FloatArray:
+        found = np.empty((self._rows, len(sheet)))
+        places = (np.ascontiguousarray(axis, np.float64).data for axis in (s, phi))
+        self._tables.read(
+            np.ascontiguousarray(sheet).data, *places, found.reshape(-1).data, slopes.reshape(-1).data
+        )
+        return found
 
 
 class _SheetSolver:

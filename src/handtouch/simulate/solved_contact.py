@@ -1,6 +1,6 @@
 """Contacts solved with the sheet beneath them: where the current of a pressed patch enters, and how much.
 
-Public names: `PatchNodes` (patches on pads, as nodes), `look_up_nodes`, `ContactLayer`,
+Public names: `PatchNodes` (patches on pads, as nodes), `look_up_nodes`, `node_slopes`, `ContactLayer`,
 `solve_patches`.
 
 The layer between conductor and sheet conducts the better the harder it is pressed: sigma = (p /
@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from handtouch.simulate.contact_patch import PROFILES, half_axes
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import SheetMapBank
+from handtouch.simulate.stages.patches import NodeSystems
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -37,7 +38,6 @@ _TILTS = {"half_tilted": 0.5, "tilted": 1.0}
 _MIN_PRESSURE = 1e-9  # over its mean
 _MIN_FORCE_N = 1e-6
 _EDGE = 1e-6  # nearest distance of a node from an edge, in sides
-_CHUNK = 1000  # systems solved at once
 
 
 class ContactLayer(NamedTuple):
@@ -269,42 +269,37 @@ def solve_patches(
     node. number: (n,) of the patch of each contact; force_n: (n,), that which its layer conducts as. Third:
     shares (n, NODES) of the nodes in each contact's current.
     """
-    own = range(NODES)
-    distance_sq = ((nodes.place_m[:, :, :, None] - nodes.place_m[:, :, None, :]) ** 2).sum(axis=1)
-    distance_sq[:, own, own] = nodes.own_m**2
-    radius = np.exp(log_radius) * nodes.radius_ratio
-    green = np.log1p(radius[:, :, None] * radius[:, None, :] / distance_sq) / (4 * math.pi)
-    n = len(number)
-    sheet = np.broadcast_to(np.asarray(sheet_ohm, np.float64), n)
-    contact_ohm_m2, reference_pa, alpha = (
-        np.broadcast_to(np.asarray(value, np.float64), n)[:, None] for value in layer
-    )
-    ohm, mean, by_node = np.empty(n), np.empty((n, len(shares))), np.empty((n, NODES))
-    for first in range(0, n, _CHUNK):
-        at = slice(first, first + _CHUNK)
-        patch = number[at]
-        pressure = np.maximum(force_n[at], _MIN_FORCE_N)[:, None] * nodes.pressure[patch]
-        conductance = nodes.area_m2[patch] * (pressure / reference_pa[at]) ** alpha[at] / contact_ohm_m2[at]
-        system = sheet[at, None, None] * green[patch]
-        system[:, own, own] += 1 / conductance
-        current = np.linalg.solve(system, np.ones((len(patch), NODES, 1)))[:, :, 0]
-        total = current.sum(axis=1)
-        ohm[at], by_node[at] = 1 / total, current / total[:, None]
-        mean[at] = np.einsum("mnk,nk->nm", shares[:, patch], by_node[at])
-    return ohm, mean, by_node
+    n, k = len(number), len(nodes.own_m)
+    columns = np.empty((5, n))
+    for column, value in zip(columns, (sheet_ohm, *layer, np.maximum(force_n, _MIN_FORCE_N)), strict=True):
+        column[:] = value
+    green, system, current = np.empty((k, NODES, NODES)), np.empty((NODES, NODES)), np.empty((n, NODES))
+    systems = NodeSystems(NODES, *map(_flat, (nodes.area_m2, nodes.pressure, green, system)))
+    radius_m = np.exp(log_radius) * nodes.radius_ratio
+    systems.fill_green(*map(_flat, (nodes.place_m, nodes.own_m, radius_m)))
+    systems.solve(*map(_flat, (number, columns[4], columns[0], columns[1:4], current)))
+    total = current.sum(axis=1)
+    by_node = current / total[:, None]
+    return 1 / total, np.einsum("mnk,nk->nm", shares[:, number], by_node), by_node
 
 
-def look_up_nodes(
-    bank: SheetMapBank, sheet: IntArray, nodes: PatchNodes
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return logarithms of conformal radii (k, NODES), shares (m, k, NODES) and their derivatives (m, 2, k,
-    NODES) by position at the nodes of patches on sheets (k,)."""
-    k = len(nodes.position)
-    values, slopes = bank.look_up_anywhere(
-        np.repeat(sheet, NODES), *nodes.position.transpose(1, 0, 2).reshape(2, -1)
-    )
-    return (
-        values[-1].reshape(k, NODES),
-        values[:-1].reshape(-1, k, NODES),
-        slopes[:-1].reshape(-1, 2, k, NODES),
-    )
+def _flat(array: NDArray[Any]) -> memoryview[Any]:
+    return np.ascontiguousarray(array).reshape(-1).data
+
+
+def look_up_nodes(bank: SheetMapBank, sheet: IntArray, nodes: PatchNodes) -> tuple[FloatArray, FloatArray]:
+    """Return logarithms of conformal radii (k, NODES) and shares (m, k, NODES) at the nodes of patches on
+    sheets (k,)."""
+    values = bank.values_anywhere(*_places(sheet, nodes)).reshape(-1, *nodes.own_m.shape)
+    return values[-1], values[:-1]
+
+
+def node_slopes(bank: SheetMapBank, sheet: IntArray, nodes: PatchNodes) -> FloatArray:
+    """Return the derivatives (m, 2, k, NODES) of the shares at the nodes of patches by position."""
+    _, slopes = bank.look_up(*_places(sheet, nodes))
+    return slopes[:-1].reshape(-1, 2, *nodes.own_m.shape)
+
+
+def _places(sheet: IntArray, nodes: PatchNodes) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return sheets and positions of all nodes of patches, each (k NODES,)."""
+    return np.repeat(sheet, NODES), nodes.position[:, 0].ravel(), nodes.position[:, 1].ravel()

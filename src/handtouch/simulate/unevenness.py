@@ -1,11 +1,12 @@
 """Logarithm of a sheet's resistance over its nominal value, as a sum of waves.
 
-Public name: `Unevenness`.
+Public names: `Unevenness`, `ohm_ratio` (of several sheets).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,14 @@ class Unevenness:
 
     def ohm_ratio(self, position: FloatArray) -> FloatArray:
         """Return the local over the nominal sheet resistance (...) at positions (2, ...)."""
-        log_ratio = np.zeros(position.shape[1:])
-        for (m, n), amplitude in zip(self.modes, self.amplitudes, strict=True):
-            log_ratio += amplitude * np.cos(m * math.pi * position[0]) * np.cos(n * math.pi * position[1])
-        return np.asarray(np.exp(log_ratio))
+        return ohm_ratio(self.modes, self.amplitudes, position)
+
+
+def ohm_ratio(
+    modes: Sequence[tuple[int, int]], amplitudes: Sequence[float] | FloatArray, position: FloatArray
+) -> FloatArray:
+    """Return `Unevenness.ohm_ratio` of a sheet, or of several: amplitudes (modes, n) at positions (2, n)."""
+    log_ratio = np.zeros(position.shape[1:])
+    for (m, n), amplitude in zip(modes, amplitudes, strict=True):
+        log_ratio += amplitude * np.cos(m * math.pi * position[0]) * np.cos(n * math.pi * position[1])
+    return np.asarray(np.exp(log_ratio))

@@ -14,7 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,9 +29,16 @@ from handtouch.simulate.faults import Fault
 from handtouch.simulate.pad_circuit import layer_of
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import SheetMapBank
-from handtouch.simulate.solved_contact import ContactLayer, PatchNodes, look_up_nodes, solve_patches
+from handtouch.simulate.solved_contact import (
+    ContactLayer,
+    PatchNodes,
+    look_up_nodes,
+    node_slopes,
+    solve_patches,
+)
 from handtouch.simulate.stimulus import AppliedContact, Stimulus
 from handtouch.simulate.truth import GroundTruth, Vector
+from handtouch.simulate.unevenness import ohm_ratio
 from handtouch.simulate.virtual_pad import VirtualPad
 from handtouch.simulate.worlds import DrawnWorld
 
@@ -111,9 +118,8 @@ class VirtualHand:
         contact_counts = Counter(contact.row for contact in all_contacts)
         special = {*self._special_rows, *(row for row, number in contact_counts.items() if number > 1)}
         if contacts := [contact for contact in all_contacts if contact.row not in special]:
-            currents, _ = self._currents(contacts, t_s)
-            rows = [contact.row for contact in contacts]
-            counts[rows] += currents * gains[rows]
+            solved = self._solve(contacts, t_s)
+            counts[solved.rows] += solved.currents_a * gains[solved.rows]
         readings = self.quantise(counts)
         for row in special:
             own = self.counts(row, [t_s])[0]
@@ -181,9 +187,12 @@ class VirtualHand:
         contacts = self._contacts_at(t_s)
         if not contacts:
             return []
+        solved = self._solve(contacts, t_s)
         return [
             self._truth(contact, currents, jacobian, sync_ns, t_s)
-            for contact, currents, jacobian in zip(contacts, *self._currents(contacts, t_s), strict=True)
+            for contact, currents, jacobian in zip(
+                contacts, solved.currents_a, self._jacobian(solved), strict=True
+            )
         ]
 
     def _contacts_at(self, t_s: float) -> list[_PadContact]:
@@ -193,8 +202,7 @@ class VirtualHand:
             for row, patch in self._touch_pads[contact.touch_number]
         ]
 
-    def _currents(self, contacts: Sequence[_PadContact], t_s: float) -> tuple[FloatArray, FloatArray]:
-        """Return currents (k, c) [A], and derivatives (k, c, 3) by x, y [fractions] and total current."""
+    def _solve(self, contacts: Sequence[_PadContact], t_s: float) -> _SolvedContacts:
         rows = np.array([contact.row for contact in contacts])
         position = np.array([(contact.contact.x, contact.contact.y) for contact in contacts]).T
         patch = np.stack([contact.column for contact in contacts], axis=1)
@@ -206,34 +214,46 @@ class VirtualHand:
             1.0 if pad.is_ideal else pad.force_ratio(times_s, None if pad.faults else on_pad[[k]])[0]
             for k, pad in enumerate(pads)
         ]
-        return self.solve_contacts(rows, position, patch, force)
+        return self._solve_patches(rows, position, patch, force)
 
     def solve_contacts(
         self, rows: NDArray[np.intp], position: FloatArray, patch: FloatArray, force: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> FloatArray:
         """Return currents (k, c) [A] of contacts (k,), each alone on its pad, at the nominal supply voltage.
 
         rows: (k,) of the pads. position: (2, k), fractions of the pad. patch: (PATCH_ROWS, k), see
-        `ContactPatch.column`. force: (k,), apparent [N]. Second: the currents' derivatives (k, c, 3) by x, y
-        [fractions] and total current.
+        `ContactPatch.column`. force: (k,), apparent [N].
         """
         if not len(rows):
-            channels = self._circuits.share_to_channel.shape[1]
-            return np.zeros((0, channels)), np.zeros((0, channels, 3))
+            return np.zeros((0, self._circuits.share_to_channel.shape[1]))
+        return self._solve_patches(rows, position, patch, force).currents_a
+
+    def _solve_patches(
+        self, rows: NDArray[np.intp], position: FloatArray, patch: FloatArray, force: FloatArray
+    ) -> _SolvedContacts:
         groups = [np.flatnonzero(rows == row) for row in np.unique(rows)]
         parts = [
             PatchNodes.of_patches(self.virtual_pads[rows[at[0]]].shape, position[:, at], patch[:, at])
             for at in groups
         ]
-        nodes = PatchNodes.joined(parts).taken(np.argsort(np.concatenate(groups)))
-        log_radius, shares, slopes = look_up_nodes(self._bank, rows, nodes)
+        nodes = parts[0]
+        if len(parts) > 1:
+            nodes = PatchNodes.joined(parts).taken(np.argsort(np.concatenate(groups)))
+        log_radius, shares = look_up_nodes(self._bank, rows, nodes)
         sheet_ohm, layer = self._circuits.sheets(rows, position)
         number = np.arange(len(rows))
         ohm, mean, by_node = solve_patches(nodes, log_radius, shares, number, force, sheet_ohm, layer)
-        collected, total = self._circuits.solve_contacts(rows, mean, ohm)
-        by_position = self._circuits.share_to_channel[rows] @ np.einsum("makn,kn->kma", slopes, by_node)
-        jacobian = np.concatenate([total[:, None, None] * by_position, collected[:, :, None]], axis=2)
-        return total[:, None] * collected, jacobian
+        return _SolvedContacts(rows, nodes, by_node, *self._circuits.solve_contacts(rows, mean, ohm))
+
+    def _jacobian(self, solved: _SolvedContacts) -> FloatArray:
+        """Return the currents' derivatives (k, c, 3) by x, y [fractions] and total current."""
+        slopes = node_slopes(self._bank, solved.rows, solved.nodes)
+        by_position = self._circuits.share_to_channel[solved.rows] @ np.einsum(
+            "makn,kn->kma", slopes, solved.by_node
+        )
+        return np.concatenate(
+            [solved.total_a[:, None, None] * by_position, solved.shares[:, :, None]], axis=2
+        )
 
     def _truth(
         self, contact: _PadContact, currents: FloatArray, jacobian: FloatArray, sync_ns: int, t_s: float
@@ -294,6 +314,25 @@ class _PadContact:
         return self.patch.column(np.array([self.contact.force_n]))[:, 0]
 
 
+class _SolvedContacts(NamedTuple):
+    """Contacts (k,), each alone on its pad, with their currents at the nominal supply voltage."""
+
+    rows: NDArray[np.intp]
+    """(k,), of the pads."""
+    nodes: PatchNodes
+    by_node: FloatArray
+    """(k, NODES), shares of the nodes in each contact's current."""
+    shares: FloatArray
+    """(k, c), of the channels in it."""
+    total_a: FloatArray
+    """(k,)."""
+
+    @property
+    def currents_a(self) -> FloatArray:
+        """(k, c), of the channels."""
+        return np.asarray(self.total_a[:, None] * self.shares)
+
+
 class _HealthyCircuits:
     """Circuits of all pads without faults: supply, contact, sheet, resistors."""
 
@@ -305,8 +344,11 @@ class _HealthyCircuits:
         self._impedance_ohm = _padded([circuit.impedance_ohm for circuit in circuits])
         self.share_to_channel = _padded([circuit.share_to_channel for circuit in circuits])
         """(rows, c, c): from the shares of grounded electrodes to those of the channels."""
-        self._unevenness = [row.circuit.unevenness for row in rows]
-        self._is_even = all(unevenness.is_even for unevenness in self._unevenness)
+        uneven = [row.circuit.unevenness for row in rows]
+        self._modes = max((one.modes for one in uneven), key=len)
+        self._amplitudes = _padded([np.array(one.amplitudes) for one in uneven]).T
+        """(modes, rows)"""
+        self._is_even = all(one.is_even for one in uneven)
 
     def solve_contacts(
         self, rows: NDArray[np.intp], shares: FloatArray, ohm: FloatArray
@@ -328,8 +370,7 @@ class _HealthyCircuits:
         """Return the local over the nominal sheet resistance (k,) at positions (2, k)."""
         if self._is_even:
             return np.ones(len(rows))
-        pairs = zip(rows.tolist(), position.T, strict=True)
-        return np.array([float(self._unevenness[row].ohm_ratio(at)) for row, at in pairs])
+        return ohm_ratio(self._modes, self._amplitudes[:, rows], position)
 
 
 def _vector(values: FloatArray) -> Vector:

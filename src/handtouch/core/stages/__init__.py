@@ -4,9 +4,6 @@ Restricted to what both give the same bits for: float and int scalars; + - * /, 
 sqrt, sin, cos and atan2 with arguments in their range. No exception may be raised.
 """
 
-import sys
+from handtouch.core.compiled import CompiledFinder
 
-from handtouch.core.compiled import Compilation, CompiledFinder
-
-if Compilation.current().compiled:
-    sys.meta_path.insert(0, CompiledFinder())
+CompiledFinder.install()

@@ -149,6 +149,8 @@ def _merge_overlapping(
     """Merge overlapping discs; rows are in the order of steps."""
     alone = np.ones(len(steps), np.bool_)
     same = np.flatnonzero(steps[1:] == steps[:-1])
+    if not len(same):
+        return steps, position, force, radius
     alone[same] = alone[same + 1] = False
     kept = [(int(steps[i]), position[i], force[i], radius[i]) for i in np.flatnonzero(alone)]
     for step in np.unique(steps[~alone]):
@@ -156,8 +158,6 @@ def _merge_overlapping(
         discs = [(position[i], float(force[i]), float(radius[i])) for i in rows]
         kept += [(int(step), *disc) for disc in _merge_discs(pad, discs)]
     kept.sort(key=lambda disc: disc[0])
-    if not kept:
-        return steps, position, force, radius
     numbers, positions, forces, radii = zip(*kept, strict=True)
     return np.array(numbers, np.intp), np.array(positions), np.array(forces), np.array(radii)
 
@@ -168,7 +168,7 @@ def clip_to_pad(
     """Clip uniform discs (k,) to the pad: each is cut by the nearest edges along x and y."""
     if not len(steps):
         return steps, position, force, radius
-    sides = np.stack([_side_lengths_m(pad, x) for x in position[:, 0].tolist()])
+    sides = _side_lengths_m(pad, position[:, 0])
     inward = np.where(position < 0.5, 1.0, -1.0)
     depth = np.clip(
         (0.5 - np.abs(position - 0.5)) * sides / radius[:, None], 0.0, 1.0
@@ -210,9 +210,10 @@ def _distance_m(pad: MujocoPad, one: Disc, other: Disc) -> float:
     return float(np.hypot(along, around))
 
 
-def _side_lengths_m(pad: MujocoPad, x: float) -> FloatArray:
-    """Return metres per unit of the fractions, at x."""
-    return np.array([pad.shape.length_m, pad.shape.arc * float(pad.shape.radius(x * pad.shape.length_m))])
+def _side_lengths_m(pad: MujocoPad, x: FloatArray | float) -> FloatArray:
+    """Return metres per unit of the fractions (..., 2), at x (...)."""
+    across = np.asarray(pad.shape.arc * pad.shape.radius(np.asarray(x) * pad.shape.length_m))
+    return np.stack([np.full(across.shape, pad.shape.length_m), across], axis=-1)
 
 
 def _set_resultants(patches: ContactPatches, grasp: GraspRecord) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.sheet_history import random_factor
-from handtouch.simulate.sheet_physics import SheetLaw, SheetState, advance
+from handtouch.simulate.sheet_physics import SheetLaw, SheetStates
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -24,46 +24,45 @@ class LiveSheets:
 
     def __init__(self, law: SheetLaw, keys: NDArray[np.uint64], period_s: float) -> None:
         self._law, self._keys, self._period_s = law, keys, period_s
-        self._states = [SheetState.fresh(law) for _ in keys]
+        self._states = SheetStates(law, len(keys))
         self._times_s = np.zeros(len(keys))
         self._presses = np.zeros(len(keys), np.int64)
-        self._loaded: set[int] = set()
+        self._loaded = np.zeros(0, np.intp)
 
     def reset(self, sheet: int) -> None:
         """Replace a sheet by one that was never pressed."""
-        self._states[sheet] = SheetState.fresh(self._law)
-        self._loaded.discard(sheet)
+        self._states.reset(sheet)
+        self._loaded = self._loaded[self._loaded != sheet]
+
+    @property
+    def are_loaded(self) -> bool:
+        """True if any had a load at the last sample."""
+        return len(self._loaded) > 0
 
     def apparent_force_n(
         self, t_s: float, sheets: IntArray, force_n: FloatArray, warmer_k: float
     ) -> FloatArray:
-        """Return the apparent forces (k,) [N] of the sheets (k,) that have a load at a sample, (k,) [N].
+        """Return the apparent forces (k,) [N] of the sheets (k,), in order, that have a load at a sample,
+        (k,) [N].
 
         `warmer_k`: temperature above that at the start.
         """
-        if not (len(sheets) or self._loaded):
-            return np.zeros(0)
-        now = set(sheets.tolist())
-        for sheet in self._loaded - now:
-            self._advance(t_s, sheet, 0.0, warmer_k)
-        self._presses[list(now - self._loaded)] += 1
-        apparent_n = np.array(
-            [
-                self._advance(t_s, sheet, load_n, warmer_k)
-                for sheet, load_n in zip(sheets.tolist(), force_n.tolist(), strict=True)
-            ]
-        )
-        self._loaded = now
+        if np.array_equal(sheets, self._loaded):
+            began = released = sheets[:0]
+        else:
+            began = np.setdiff1d(sheets, self._loaded, assume_unique=True)
+            released = np.setdiff1d(self._loaded, sheets, assume_unique=True)
+        idle = began[t_s - self._period_s - self._times_s[began] > 0]
+        idle_s = t_s - self._period_s - self._times_s[idle]
+        self._states.advance(idle, idle_s, 0.0, warmer_k=warmer_k)
+        self._times_s[idle] += idle_s
+        changing, load_n = np.concatenate([sheets, released]), np.zeros(len(sheets) + len(released))
+        load_n[: len(sheets)] = force_n
+        apparent_n = self._states.advance(changing, t_s - self._times_s[changing], load_n, warmer_k=warmer_k)
+        self._times_s[changing], self._loaded = t_s, sheets
+        self._presses[began] += 1
+        apparent_n = apparent_n[: len(sheets)]
         times_s = np.full(len(sheets), t_s)
         return apparent_n * random_factor(
             self._law, self._keys[sheets], times_s, apparent_n, self._presses[sheets]
         )
-
-    def _advance(self, t_s: float, sheet: int, load_n: float, warmer_k: float) -> float:
-        """Return the apparent force at `t_s` without its random part."""
-        state, time_s = self._states[sheet], float(self._times_s[sheet])
-        if sheet not in self._loaded and (idle_s := t_s - self._period_s - time_s) > 0:
-            advance(self._law, state, idle_s, 0.0, True, warmer_k)
-            time_s += idle_s
-        self._times_s[sheet] = t_s
-        return advance(self._law, state, t_s - time_s, load_n, True, warmer_k)

@@ -6,6 +6,7 @@ Public name: `SimulatedPads`.
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -72,7 +73,8 @@ class SimulatedPads:
         whose environments are the hands."""
         counts = self._hand.untouched_counts(t_s, self._count)
         hand, pad, currents = self._currents(t_s, self._discs(contacts))
-        counts[hand, pad] += currents * self._hand.counts_per_ampere(t_s)[pad]
+        if len(hand):
+            counts[hand, pad] += currents * self._hand.counts_per_ampere(t_s)[pad]
         return self._hand.quantise(counts)
 
     def _discs(self, contacts: LinkPoints) -> _Discs:
@@ -101,12 +103,12 @@ class SimulatedPads:
     def _currents(self, t_s: float, discs: _Discs) -> tuple[IntArray, IntArray, FloatArray]:
         """Return hands, pads (k,) and currents (k, 4) [A], at the nominal voltage, of the touched pads."""
         force_n = discs.force_n * self._force_ratio(t_s, discs)
-        _, inverse, number = np.unique(discs.key, return_inverse=True, return_counts=True)
-        alone = number[inverse] == 1
+        same = np.diff(discs.key, prepend=-1, append=-1) == 0  # they are in order
+        alone = ~(same[1:] | same[:-1])
         patch = evenly_pressed(discs.radius_m[alone])
         hands, pads = [discs.hand[alone]], [discs.pad[alone]]
         position = discs.position[alone].T
-        found = [self._hand.solve_contacts(pads[0], position, patch, force_n[alone])[0]]
+        found = [self._hand.solve_contacts(pads[0], position, patch, force_n[alone])]
         for pad in np.unique(discs.pad[~alone]).tolist():
             rows = np.flatnonzero(~alone & (discs.pad == pad))
             touched, stimulus = _several_discs(discs, force_n, rows)
@@ -120,14 +122,14 @@ class SimulatedPads:
     def _force_ratio(self, t_s: float, discs: _Discs) -> FloatArray:
         """Return apparent over true force of the discs (k,), and let the sheets' histories go on."""
         warmer_k, ratio = self._hand.temperature_rise_k(t_s), np.ones(len(discs.pad))
-        for pad, sheets in enumerate(self._sheets):
-            if sheets:
-                rows = np.flatnonzero(discs.pad == pad)
-                hands, disc = np.unique(discs.hand[rows], return_inverse=True)
-                total_n: FloatArray = np.zeros(len(hands))
-                np.add.at(total_n, disc, discs.force_n[rows])
-                apparent_n = sheets.apparent_force_n(t_s, hands, total_n, warmer_k)
-                ratio[rows] = (apparent_n / total_n)[disc]
+        ends = np.searchsorted(discs.pad, np.arange(len(self._sheets) + 1))  # discs are in order of pads
+        for sheets, (first, end) in zip(self._sheets, itertools.pairwise(ends.tolist()), strict=True):
+            if sheets and (end > first or sheets.are_loaded):
+                hand, force_n = discs.hand[first:end], discs.force_n[first:end]
+                begins = np.flatnonzero(np.diff(hand, prepend=-1))  # and on each pad in order of hands
+                total_n = np.add.reduceat(force_n, begins) if end > first else force_n
+                apparent_n = sheets.apparent_force_n(t_s, hand[begins], total_n, warmer_k)
+                ratio[first:end] = np.repeat(apparent_n / total_n, np.diff(begins, append=end - first))
         return ratio
 
 
