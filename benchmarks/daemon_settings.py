@@ -6,6 +6,8 @@ process' worker in this process, so that a run is repeatable and as fast as it c
 
 from __future__ import annotations
 
+import time
+
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel
@@ -51,6 +53,8 @@ class InlineProcess(ChildProcess):
         super().__init__("", "percept", lambda: b"")
         self.worker = PerceptWorker(deployment)
         self.waiting: list[bytes] = []
+        self.busy_s = 0.0
+        """processor time of the worker"""
 
     @property
     def pid(self) -> int | None:
@@ -67,7 +71,9 @@ class InlineProcess(ChildProcess):
 
     def send(self, message: bytes) -> bool:
         """Process a message at once."""
+        begun_s = time.process_time()
         self.waiting += map(pack_message, self.worker.process_input(unpack_input(message)))
+        self.busy_s += time.process_time() - begun_s
         return True
 
     def receive(self, now_ns: int, max_messages: int = 8) -> list[bytes]:  # noqa: ARG002

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zmq
@@ -37,6 +37,7 @@ from handtouch.simulate.grasp.event_score import (
     merge_spans,
     touch_spans,
 )
+from handtouch.simulate.grasp.grasp_objects import GraspObject
 from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches, contact_patches
@@ -94,23 +95,25 @@ class Served:
     """Published contact messages, also those without a position in the palm."""
     seed: int = 0
     """Of the hand's parts and mounts."""
+    percepts_s: float = 0.0
+    """Processor time of the percept process."""
 
 
 def served(
     deployment: Deployment,
-    name: str,
+    name: str | GraspObject,
     seed: int,
     world: DrawnWorld,
     *,
     assumed_radius: bool = False,
-    perceive: bool = False,
+    perceive: Literal[True] | Sequence[str] = (),
     duration_s: float = DURATION_S,
     done: GraspRecord | None = None,
 ) -> Served:
     """Let the first hand grasp and process the samples; its file describes sheets as their builder would.
 
     `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
-    `perceive` requests all percepts; `done` is the grasp if it has been simulated already.
+    `perceive` requests percepts, all or some kinds; `done` is the grasp if it has been simulated already.
     """
     deployment = world.describe(deployment)
     hand = deployment.hands[0]
@@ -131,7 +134,8 @@ def served(
         run.inputs.close()
         run.authenticator.close()
     railed = sum(int((np.abs(of) >= 32767).any(axis=1).sum()) for of in counts)
-    return replace(_compared(deployment, grasp, patches, run, railed), seed=seed)
+    compared = _compared(deployment, grasp, patches, run, railed)
+    return replace(compared, seed=seed, percepts_s=run.process.busy_s)
 
 
 def _readings(virtual: VirtualHand, row: int, times_s: FloatArray) -> NDArray[np.int64]:
@@ -150,7 +154,7 @@ class _Run:
         context: zmq.Context[Any],
         grasp: GraspRecord,
         world: DrawnWorld,
-        perceive: bool = False,
+        perceive: Literal[True] | Sequence[str] = (),
     ) -> None:
         model, robots = PadModel(deployment), RobotModels(deployment)
         self.poses = LinkPoses(robots.kinematics[0])
@@ -171,15 +175,15 @@ class _Run:
         all_pads = np.ones(model.size, np.bool_)
         requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), all_pads, ~all_pads)
         if perceive:
-            percepts = np.ones((len(PERCEPT_KINDS), model.size), np.bool_)
+            kinds = PERCEPT_KINDS if perceive is True else perceive
+            percepts = np.repeat(np.isin(PERCEPT_KINDS, kinds)[:, None], model.size, axis=1)
             requested = requested._replace(percepts=percepts)
         self.pipeline.apply_demand(requested)
         for row, (_, pad) in enumerate(deployment.pads):
             if pad.shear:
                 self.pipeline.slab.set_layout(row, _LAYOUT)
-        self._perceiving = PerceptPublisher(
-            deployment, self.pipeline, self, process=InlineProcess(deployment)
-        )
+        self.process = InlineProcess(deployment)
+        self._perceiving = PerceptPublisher(deployment, self.pipeline, self, process=self.process)
         self._perceiving.set_requested(requested, _START_NS)
         self.contacts: list[wire.Contact] = []
         self.percepts: list[wire.Percept] = []

@@ -71,8 +71,13 @@ UNITS = {
 }
 NODE_FILE = "node file"
 SAME = {"hand.pad.touch": "touch"}
-KIND_TITLES = {"surface": "Surfaces", "pattern": "Shear patterns", "source": "`[source.NAME]`"}
-KIND_ANCHORS = {"surface": "surfaces", "pattern": "shear-patterns"}
+KIND_TITLES = {
+    "surface": "Surfaces",
+    "pattern": "Shear patterns",
+    "shape": "Shapes of objects",
+    "source": "`[source.NAME]`",
+}
+KIND_ANCHORS = {"surface": "surfaces", "pattern": "shear-patterns", "shape": "shapes-of-objects"}
 TITLES = {"": "Keys before the first table", "trim file": "Trim file"}
 TYPES = {str: "text", bool: "`true`, `false`", int: "integer", float: "number"}
 

@@ -53,6 +53,7 @@ COMMANDS = {
     "disable": "disable pads: no contacts, excitation off",
     "enable": "enable disabled pads again",
     "reload": "make the daemon read its deployment file again; pads that don't change are not disturbed",
+    "object": "state which known object a hand handles, whose pose the percept `object` estimates",
     "log": "set the daemon's log level",
     "bridge": "forward the topics of daemons to a ROS 2 or Zenoh network",
     "keys": "manage the keys (ZeroMQ CURVE) with which clients on other machines connect to a daemon",
@@ -74,7 +75,7 @@ COMMANDS = {
 }
 """Commands in the order of `--help`, which shows these lines; `handtouch.cli.NAME` holds each."""
 
-REQUESTS = ("tare", "scene", "snapshot", "disable", "enable", "reload", "log")
+REQUESTS = ("tare", "scene", "snapshot", "disable", "enable", "reload", "object", "log")
 """Commands that send one request to the daemon, which `handtouch.cli.requests` holds."""
 
 INTERRUPTED_STATUS = 130

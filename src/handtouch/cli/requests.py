@@ -6,6 +6,7 @@ Exit status 0, 1 (no daemon answers, it refuses, or a pad was refused), 2 (an in
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
@@ -62,6 +63,22 @@ def add_reload(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dry-run", action="store_true", help="print the changes without applying them")
 
 
+def add_object(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `object`."""
+    add_request(parser, partial(run_request, "object", _object_lines))
+    parser.add_argument("hand", metavar="HAND", help="name of the hand")
+    parser.add_argument(
+        "name", metavar="NAME", nargs="?", help="object of the deployment (default: no change)"
+    )
+    parser.add_argument(
+        "--table",
+        type=json.loads,
+        metavar="JSON",
+        help='another object, as its table: {"shape": {"kind": "sphere", "diameter_mm": 60}}',
+    )
+    parser.add_argument("--none", action="store_true", default=None, help="the hand handles no known object")
+
+
 def add_log(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `log`."""
     add_request(parser, partial(run_request, "log", _log_lines))
@@ -84,7 +101,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         type=comma_separated,
         metavar="NAMES",
         help="outputs in use, of position, force, raw (samples), palm and base (positions in these frames), "
-        'motion (slip), shape, friction; "": only whether a pad is touched',
+        'motion (slip), shape, friction, object; "": only whether a pad is touched',
     )
     parser.add_argument(
         "--rate-hz", type=float, metavar="HZ", help="rate of contact updates; 0: one per SYNC"
@@ -144,6 +161,16 @@ def run_request(
         for line in format_lines(answer):
             print(line)
     return 0 if command != "tare" or all(pad["tared"] for pad in answer["pads"]) else 1
+
+
+def _object_lines(answer: Reply) -> Iterator[str]:
+    shape = (answer["table"] or {}).get("shape", {})
+    keys = ", ".join(f"{key} {value}" for key, value in shape.items())
+    yield (
+        f"{answer['hand']}: {answer['name']}, {keys}"
+        if answer["name"]
+        else f"{answer['hand']}: no known object"
+    )
 
 
 def _log_lines(answer: Reply) -> Iterator[str]:

@@ -18,7 +18,7 @@ from handtouch import wire
 from handtouch.client.subscriber import request
 from handtouch.host.endpoints import CONTROL_ENDPOINT
 
-Output = Literal["position", "force", "palm", "base", "raw", "motion", "shape", "friction"]
+Output = Literal["position", "force", "palm", "base", "raw", "motion", "shape", "friction", "object"]
 SHORT_TIMEOUT_S, LONG_TIMEOUT_S = 3.0, 60.0
 SLOW_COMMANDS = ("tare", "reload")
 M = TypeVar("M")
@@ -99,6 +99,16 @@ class PadCalibration(TypedDict):
     law: LawValues
     store: str | None
     """path of the calibration store that the daemon reads; None without supervisor"""
+
+
+class HandObject(TypedDict):
+    """The object in a hand."""
+
+    hand: str
+    name: str | None
+    """None: none is stated"""
+    table: dict[str, Any] | None
+    """as [object.NAME] of a deployment"""
 
 
 class ReloadResult(TypedDict):
@@ -207,6 +217,28 @@ class DaemonControl:
         """Read the deployment file again and apply it; `dry_run`: only return what would change."""
         answer = self._request("reload", dry_run=dry_run)
         return ReloadResult(applied=answer["applied"], tables=answer["tables"], pads=answer["pads"])
+
+    def object(
+        self,
+        hand: str,
+        name: str | None = None,
+        shape: Mapping[str, Any] | None = None,
+        *,
+        none: bool = False,
+    ) -> HandObject:
+        """Set the object in a hand, whose pose the percept `object` estimates; return it.
+
+        `name`: of the deployment, or with `shape`, as in its [object.NAME], of another; a mesh must be stated
+        there. `none`: the hand has no known object. With the hand alone, nothing changes.
+        """
+        given = {
+            "name": name,
+            "table": None if shape is None else {"shape": dict(shape)},
+            "none": none or None,
+        }
+        changes = {key: value for key, value in given.items() if value is not None}
+        answer = self._request("object", hand=hand, **changes)
+        return HandObject(hand=answer["hand"], name=answer["name"], table=answer["table"])
 
     def log(self, level: Literal["debug", "info", "warning", "error"]) -> str:
         """Set the daemon's log level; return the previous one."""

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from handtouch.config import shipped
 from handtouch.config.base import Table
 from handtouch.config.checks import problems_in, problems_in_buses
+from handtouch.config.objects import ObjectTable
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.shear import Shear
 from handtouch.config.surfaces import SurfaceTable, surface_table
@@ -49,6 +50,7 @@ __all__ = [
     "Mount",
     "NamedPad",
     "Node",
+    "ObjectTable",
     "Pad",
     "Problem",
     "Shear",
@@ -96,11 +98,22 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
         hand.model_copy(update={"urdf": _resolve_path(hand.urdf, folder or Path())}) if hand.urdf else hand
         for hand in deployment.hands
     )
+    objects = {
+        name: entry.model_copy(
+            update={
+                "shape": entry.shape.model_copy(update={"file": str((folder or Path()) / entry.shape.file)})
+            }
+        )
+        if entry.shape.kind == "mesh"
+        else entry
+        for name, entry in deployment.objects.items()
+    }
     daemon = deployment.daemon
     if daemon.keys:
         daemon = daemon.model_copy(update={"keys": str((folder or Path()) / daemon.keys)})
     return _check_deployment(
-        deployment.model_copy(update={"nodes": nodes, "daemon": daemon, "hands": hands}), file
+        deployment.model_copy(update={"nodes": nodes, "daemon": daemon, "hands": hands, "objects": objects}),
+        file,
     )
 
 

@@ -46,6 +46,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
     yield from _check_touch("[touch]: ", deployment.touch)
     yield from _check_names("[[hand]]", "name", [hand.name for hand in deployment.hands])
     yield from _check_scene(deployment)
+    yield from _check_objects(deployment)
     yield from unit_problems(deployment)
     taken: dict[tuple[str, int], str] = {}
     owners: dict[int, str] = {}
@@ -89,6 +90,25 @@ def _check_scene(deployment: Deployment) -> Iterator[Problem]:
         if not deployment.rows_matching(pattern):
             pads = ", ".join(deployment.pad_names)
             yield Problem("[scene]: links", _format_value(pattern), f"matches no pad; pads: {pads}")
+
+
+def _check_objects(deployment: Deployment) -> Iterator[Problem]:
+    for number, hand in enumerate(deployment.hands, 1):
+        if hand.object is not None and hand.object not in deployment.objects:
+            hint = suggest_name(hand.object, list(deployment.objects))
+            known = ", ".join(deployment.objects) or "none"
+            yield Problem(
+                f'[[hand]] {number} "{hand.name}": object',
+                f" = {json.dumps(hand.object)}",
+                f"there is no [object.{hand.object}]; {hint}known: {known}",
+            )
+    for name, entry in deployment.objects.items():
+        if entry.shape.kind == "bolt" and entry.shape.head_diameter_mm <= entry.shape.diameter_mm:
+            yield Problem(
+                f"[object.{name}]: shape.head_diameter_mm",
+                f" = {entry.shape.head_diameter_mm:g}",
+                "must be more than diameter_mm; a bolt without a head is a cylinder",
+            )
 
 
 def _check_names(section: str, key: str, names: list[str]) -> Iterator[Problem]:

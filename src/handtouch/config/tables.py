@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from handtouch.config.base import Table
+from handtouch.config.objects import OBJECT_SHAPES, ObjectTable
 from handtouch.config.shear import SHEAR_PATTERNS, Shear
 from handtouch.config.surfaces import SURFACE_TABLES, PadSurface
 from handtouch.host.endpoints import (
@@ -35,7 +36,7 @@ def _refuse_removed(output: object) -> object:
     return output
 
 
-Output = Literal["position", "force", "raw", "palm", "base", "motion", "shape", "friction"]
+Output = Literal["position", "force", "raw", "palm", "base", "motion", "shape", "friction", "object"]
 RequestedOutput = Annotated[Output, BeforeValidator(_refuse_removed)]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 MIN_ELECTRODES, MAX_ELECTRODES = 3, 16
@@ -616,6 +617,12 @@ class HandTable(Table):
         description="direction of gravity in the base frame, to compensate the weight of the pads; joint "
         "states of a moving base may override it",
     )
+    object: Name | None = Field(
+        None,
+        description="object that the hand handles, of the tables [object.NAME]; the control command `object` "
+        "may replace it; default: none",
+        examples=["bolt"],
+    )
     grouping_distance_mm: NonNegative = Field(
         25.0, description="contacts at most this far apart are published as a group, probably of one object"
     )
@@ -632,7 +639,7 @@ class SceneRequest(Table):
         ("position", "force"),
         description="outputs of a contact that are computed; raw: pads are sampled with every SYNC even "
         "while untouched; palm, base: positions in these frames, which need [[hand]] urdf and joint states; "
-        "motion, shape, friction: computed even without a subscriber",
+        "motion, shape, friction, object: computed even without a subscriber",
     )
     rate_hz: Positive | None = Field(
         None,
@@ -683,6 +690,7 @@ class Deployment(Table):
     nodes: dict[Name, Node] = Field(alias="node")
     sheets: dict[Name, Sheet] = Field(alias="sheet")
     shears: dict[Name, Shear] = Field({}, alias="shear")
+    objects: dict[Name, ObjectTable] = Field({}, alias="object")
     touch: Touch = Touch()
     hands: Annotated[tuple[HandTable, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
 
@@ -721,11 +729,16 @@ TABLES: dict[str, type[Table]] = {
     "sheet.*": Sheet,
     "sheet.*.behaviour": Behaviour,
     "shear.*": Shear,
+    "object.*": ObjectTable,
     "touch": Touch,
     "hand": HandTable,
     "hand.pad": Pad,
     "hand.pad.mount": Mount,
     "hand.pad.touch": Touch,
 }
-KINDS: dict[str, dict[str, type[Table]]] = {"surface": {**SURFACE_TABLES}, "pattern": {**SHEAR_PATTERNS}}
+KINDS: dict[str, dict[str, type[Table]]] = {
+    "surface": {**SURFACE_TABLES},
+    "pattern": {**SHEAR_PATTERNS},
+    "shape": OBJECT_SHAPES,
+}
 """Models by the key `kind`, of each table that follows one of several."""

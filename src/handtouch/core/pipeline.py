@@ -14,6 +14,7 @@ from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contacts import ContactChanges, ContactDetector, IntArray
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
+from handtouch.core.hand_poses import FloatArray, HandPoses
 from handtouch.core.journal import TickJournal
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
@@ -55,6 +56,7 @@ class Pipeline:
         self.cycle = Cycle(period_ns, window)
         self.tick = TickProcessor(model, period_ns, self.state)
         self.transforms = ContactTransforms(model.hands, robots, self.state)
+        self._hand_poses = HandPoses(robots) if robots else None
         self.messages = TickMessages(model, self.tick, session, self.transforms)
         self.node_state: NDArray[np.uint8] = np.full(model.size, PadState.STARTING, dtype=np.uint8)
         self.on_tick_computed: Callable[[], None] = lambda: None
@@ -103,6 +105,11 @@ class Pipeline:
     def set_gravity(self, directions: NDArray[np.float64]) -> None:
         """Set the unit direction of gravity in each link's frame (n, 3), NaN where unknown."""
         self.add_event(GravityEvent(tuple(map(tuple, directions.tolist()))))
+
+    def link_poses(self, hand: str, t_ns: int) -> tuple[FloatArray, FloatArray] | None:
+        """Return the poses of a hand at a time, see `HandPoses.compute`; None without joints."""
+        joints = self.transforms.joints_at(hand, t_ns)
+        return None if joints is None or self._hand_poses is None else self._hand_poses.compute(hand, joints)
 
     def add_force_reference(self, reference: ForceReference) -> None:
         """Add forces on pads, measured by another sensor."""

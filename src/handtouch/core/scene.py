@@ -330,6 +330,8 @@ class Demand:
         action_requests = in_scene & [has(f"percept/{hand}/action_request") for hand, _ in names]
         percepts = np.array([[has(f"percept/{hand}/{kind}") for hand, _ in names] for kind in PERCEPT_KINDS])
         percepts = in_scene & (percepts | needed.percepts | action_requests)
+        motion, known_object = (PERCEPT_KINDS.index(kind) for kind in ("motion", "object"))
+        percepts[motion] |= percepts[known_object]  # by which contacts stick
         perceived = percepts.any(axis=0)
         located = needed.position | needed.force  # force depends on the position
         with np.errstate(divide="ignore"):

@@ -5,6 +5,7 @@ Public names: `ControlCommands`, `STATUS_AGE_NS`.
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,7 @@ from pydantic import Field
 
 from handtouch import wire
 from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LawParameters
-from handtouch.config import Deployment, Table
+from handtouch.config import Deployment, ObjectTable, Table
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import RequestedOutput, SceneRequest
 from handtouch.core.events import BaselineEvent, EvidenceEvent
@@ -35,6 +36,7 @@ from handtouch.daemon.control import (
     RefusedError,
     Reply,
 )
+from handtouch.daemon.percept_client import known_object
 from handtouch.daemon.reload import DeploymentChange, ReloadJob
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.status_reporter import StatusReporter
@@ -97,6 +99,13 @@ class _ReloadArguments(Table):
     dry_run: bool = False
 
 
+class _ObjectArguments(Table):
+    hand: Annotated[str, Field(max_length=64)]
+    name: ClientName | None = None
+    table: dict[str, Any] | None = None
+    none: bool = False
+
+
 class _LogArguments(Table):
     level: Literal["debug", "info", "warning", "error"]
 
@@ -131,6 +140,7 @@ class ControlCommands:
             "enable": partial(self._switch, True),
             "disable": partial(self._switch, False),
             "log": self._set_log_level,
+            "object": self._set_object,
         }
         self.by_name: dict[str, Command] = {
             "status": self._status,
@@ -318,6 +328,8 @@ class ControlCommands:
                 supervisor.restart_with(change.deployment, now_ns)
         if self._reporter.percepts is not None and change.changed_keys_of_pad:
             self._reporter.percepts.restart_with(change.deployment, now_ns)
+        if self._reporter.percepts is not None:
+            self._reporter.percepts.set_stated_objects(change.deployment)
         self._files = change.files
         self._pipeline.journal.publish_config(change.deployment, dict(change.files), build_info(), now_ns)
         self._demand.scenes.set_file(change.deployment.scene)
@@ -333,6 +345,37 @@ class ControlCommands:
         before = logging.getLevelName(logging.getLogger("handtouch").getEffectiveLevel()).lower()
         set_level(request.level)
         return {"previous_level": before, "level": request.level}
+
+    def _set_object(self, arguments: dict[str, Any], now_ns: int) -> Reply:  # noqa: ARG002
+        """Set the object in a hand: one of the deployment by its name, or another by its table, or none."""
+        request = parse_arguments(_ObjectArguments, arguments)
+        percepts = self._reporter.percepts
+        if percepts is None or request.hand not in percepts.objects:
+            known = ", ".join(hand.name for hand in self.deployment.hands)
+            raise RefusedError(f"hand = {request.hand!r}: there is no such hand; known: {known}")
+        if request.none:
+            percepts.set_object(request.hand, "")
+        elif request.name is not None:
+            percepts.set_object(request.hand, known_object(request.name, self._object_table(request)))
+        name, _, table = percepts.objects[request.hand].partition("=")
+        return {"hand": request.hand, "name": name or None, "table": json.loads(table) if table else None}
+
+    def _object_table(self, request: _ObjectArguments) -> ObjectTable:
+        assert request.name is not None
+        if request.table is None:
+            if request.name not in self.deployment.objects:
+                known = ", ".join(self.deployment.objects) or "none"
+                raise RefusedError(
+                    f"name = {request.name!r}: the deployment has no such object; known: {known}; state "
+                    "another with table"
+                )
+            return self.deployment.objects[request.name]
+        if "=" in request.name:
+            raise RefusedError(f"name = {request.name!r}: must have no =")
+        table = parse_arguments(ObjectTable, request.table)
+        if table.shape.kind == "mesh":
+            raise RefusedError("a mesh must be stated in the deployment; send its name without a table")
+        return table
 
     def _select_pads(self, patterns: Sequence[str]) -> NDArray[np.bool_]:
         try:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.config import Deployment
+from handtouch.config import Deployment, ObjectTable
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.stages.slip import SLIP_SLICES
@@ -23,7 +23,7 @@ from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.tick import TickResult
 from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
-from handtouch.wire import PERCEPT_KINDS, ForceStatus, PositionStatus
+from handtouch.wire import PERCEPT_KINDS, ForceStatus, PadState, PositionStatus
 
 IntArray = NDArray[np.intp]
 _IDLE_PERIOD_NS = 50_000_000
@@ -35,8 +35,21 @@ _VALUE_COLUMNS = (
     *("xy", "pad_m", "pad_noise_m2", "position_m", "normal", "covariance_m2"),
     *("force_n", "force_std_n", "residual", "residual_std"),
 )
-_MOTION = PERCEPT_KINDS.index("motion")
+_MOTION, _OBJECT = PERCEPT_KINDS.index("motion"), PERCEPT_KINDS.index("object")
 _log = logging.getLogger("handtouch.percept")
+
+
+def stated_objects(deployment: Deployment) -> dict[str, str]:
+    """Return the object of each hand of a deployment, as `wire.PerceptInput.known_object` states it."""
+    return {
+        hand.name: "" if hand.object is None else known_object(hand.object, deployment.objects[hand.object])
+        for hand in deployment.hands
+    }
+
+
+def known_object(name: str, table: ObjectTable) -> str:
+    """Return an object as `wire.PerceptInput.known_object` states it."""
+    return f"{name}={table.model_dump_json()}"
 
 
 class PerceptClient:
@@ -67,6 +80,10 @@ class PerceptClient:
         self._needed_ns = 0
         self._seq: Counter[str] = Counter()
         self._sent_ns = dict.fromkeys(pipeline.model.rows_of_hand, 0)
+        self._snapshot_ns = dict.fromkeys(pipeline.model.rows_of_hand, 0)
+        self._object_pads: NDArray[np.bool_] = np.zeros(n, dtype=np.bool_)
+        self._stated = stated_objects(deployment)
+        self._objects = dict(self._stated)
         self._last_sent_sync_ns = 0
         self._status: PerceptStatus | None = None
 
@@ -85,7 +102,7 @@ class PerceptClient:
         bits = np.concatenate([kinds, actions])
         self._requested = np.packbits(bits, axis=0, bitorder="little")[0]
         bits[_MOTION] = False  # the core detects it
-        self._pads = np.asarray(bits.any(axis=0))
+        self._pads, self._object_pads = np.asarray(bits.any(axis=0)), bits[_OBJECT]
         self._needed, self._needed_ns = bool(self._pads.any()), now_ns
         if self._needed and not self.process.enabled:
             self.process.start(now_ns)
@@ -94,6 +111,21 @@ class PerceptClient:
         """Restart the process with a reloaded deployment."""
         self._deployment = deployment
         self.process.restart(now_ns)
+
+    def set_stated_objects(self, deployment: Deployment) -> None:
+        """Set the objects of a reloaded deployment, of the hands where they differ from those before."""
+        after = stated_objects(deployment)
+        self._objects |= {hand: known for hand, known in after.items() if known != self._stated.get(hand)}
+        self._stated = after
+
+    def set_object(self, hand: str, known: str) -> None:
+        """Set the object in a hand, as `wire.PerceptInput.known_object` states it; empty for none."""
+        self._objects[hand] = known
+
+    @property
+    def objects(self) -> Mapping[str, str]:
+        """The object in each hand, alike."""
+        return self._objects
 
     def process_tick(self, result: TickResult, now_ns: int) -> None:
         """Send a tick's contacts; publish the percepts that were received."""
@@ -137,7 +169,7 @@ class PerceptClient:
         self._seq[hand] += 1
         tick = self._pipeline.tick
         columns, values, slip = tick.columns, tick.columns.values[rows], tick.slip.state[rows]
-        fields = {name: values[:, VALUE_SLICES[name]].tobytes() for name in _VALUE_COLUMNS}
+        fields: dict[str, Any] = {name: values[:, VALUE_SLICES[name]].tobytes() for name in _VALUE_COLUMNS}
         log_odds = slip[:, SLIP_SLICES["log_odds"]]
         log_odds[slip[:, SLIP_SLICES["slipping"]] != 0] = np.inf
         log_odds[tick.slip.contact_id[rows] == 0] = np.nan
@@ -160,9 +192,26 @@ class PerceptClient:
             **fields,
             **self._palm_columns(rows),
             **self._shear_columns(rows),
+            **self._snapshot(hand, hand_rows, sync_ns),
         )
 
-    def _palm_columns(self, rows: IntArray) -> dict[str, bytes]:
+    def _snapshot(self, hand: str, rows: slice, sync_ns: int) -> dict[str, Any]:
+        """Return what is sent 20 times a second about a hand whose object's pose is requested."""
+        due = sync_ns - self._snapshot_ns[hand] >= _IDLE_PERIOD_NS
+        if not (due and np.count_nonzero(self._object_pads[rows])):
+            return {}
+        self._snapshot_ns[hand] = sync_ns
+        if (poses := self._pipeline.link_poses(hand, sync_ns)) is None:
+            return {}
+        clear = (self._pipeline.tick.columns.state[rows] == PadState.CLEAR) & self._object_pads[rows]
+        return {
+            "clear": clear.astype("<u1").tobytes(),
+            "link_poses": poses[0].tobytes(),
+            "base_pose": poses[1].tobytes(),
+            "known_object": self._objects[hand],
+        }
+
+    def _palm_columns(self, rows: IntArray) -> dict[str, Any]:
         transforms = self._pipeline.transforms
         if not (transforms.any_requested and len(rows)):
             return {}
@@ -176,7 +225,7 @@ class PerceptClient:
             "joints_age_s": age_s.tobytes(),
         }
 
-    def _shear_columns(self, rows: IntArray) -> dict[str, bytes]:
+    def _shear_columns(self, rows: IntArray) -> dict[str, Any]:
         """Return force vectors, NaN where there is none or no ratio with the normal force."""
         tick = self._pipeline.tick
         if not (tick.shear.any_configured and len(rows)):

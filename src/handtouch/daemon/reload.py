@@ -147,10 +147,12 @@ def find_changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]]
         if what:
             pads[number] = what
     tables = [name for name in ("daemon", "scene", "touch") if getattr(old, name) != getattr(new, name)]
-    for name in ("nodes", "sheets", "shears"):
+    for name in ("nodes", "sheets", "shears", "objects"):
         before_all, after_all = getattr(old, name), getattr(new, name)
         keys = sorted(before_all.keys() | after_all.keys())
         tables += [f"{name[:-1]}.{key}" for key in keys if before_all.get(key) != after_all.get(key)]
+    pairs_of_hands = zip(old.hands, new.hands, strict=True)
+    tables += [f"hand {after.name}" for before, after in pairs_of_hands if before.object != after.object]
     return pads, tables
 
 
@@ -163,7 +165,9 @@ def find_restart_changes(old: Deployment, new: Deployment) -> list[str]:
         differences.append("[[bus]] differs")
     for before, after in zip(old.hands, new.hands, strict=False):
         differences += [
-            f"[[hand]] {after.name}: {key} differs" for key in _changed_keys(before, after) if key != "pads"
+            f"[[hand]] {after.name}: {key} differs"
+            for key in _changed_keys(before, after)
+            if key not in ("pads", "object")
         ]
     names = [[(hand.name, pad.link) for hand in d.hands for pad in hand.pads] for d in (old, new)]
     if names[0] != names[1]:

@@ -1,8 +1,7 @@
 """Signed distance of a point from the body of a link: negative inside.
 
-Public names: `signed_distance_m`, `find_mesh`, `load_triangles`, `unreadable_mesh`,
-`can_read_meshes`. Meshes are read by Coal,
-the extra `handtouch[urdf]`.
+Public names: `signed_distance_m`, `squared_distance_from_triangles`, `find_mesh`, `load_triangles`,
+`unreadable_mesh`, `can_read_meshes`. Meshes are read by Coal, the extra `handtouch[urdf]`.
 """
 
 from __future__ import annotations
@@ -138,7 +137,7 @@ def _distance_from_triangles(triangles: FloatArray, points: FloatArray) -> Float
     found = []
     for point in points:
         a, b, c = (triangles - point).transpose(1, 0, 2)
-        near = np.sqrt(_squared_distance_from_triangles(a, b, c).min())
+        near = np.sqrt(squared_distance_from_triangles(a, b, c).min())
         la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
         dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]
         volume = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -147,7 +146,7 @@ def _distance_from_triangles(triangles: FloatArray, points: FloatArray) -> Float
     return np.array(found)
 
 
-def _squared_distance_from_triangles(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+def squared_distance_from_triangles(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     """Return squared distances (k,) of the origin from triangles: from the interior, or the nearest edge."""
     sides = np.stack(
         [

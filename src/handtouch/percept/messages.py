@@ -51,6 +51,7 @@ def make_percept_message(percept: PerceptEstimate, hand: str, link: str) -> wire
         values=dict(percept.values),
         evidence=dict(percept.evidence),
         reason=percept.reason,
+        poses=percept.poses,
     )
 
 
@@ -113,6 +114,8 @@ def unpack_output(data: bytes) -> wire.Percept | PerceptStatus:
     _check_map("probabilities", message.probabilities, _is_probability)
     _check_map("evidence", message.evidence, _is_number)
     _check_map("values", message.values, _is_value)
+    if len(message.poses) > wire.MAX_POSES or not all(map(_is_pose, message.poses)):
+        raise PerceptMessageError("a pose is invalid")
     if max(map(len, (message.label, message.reason, message.question))) > _MAX_TEXT:
         raise PerceptMessageError("a text is too long")
     return message
@@ -134,6 +137,17 @@ def _check_map(name: str, entries: Mapping[Any, Any], check: Any) -> None:
     for key, value in entries.items():
         if type(key) is not str or not check(value):
             raise PerceptMessageError(f"{name}: {key!r:.80} is invalid")
+
+
+def _is_pose(pose: Mapping[Any, Any]) -> bool:
+    """Return whether a pose has its required keys, and as many finite numbers in each as it must."""
+    lengths = {"position_m": 3, "quaternion": 4, "covariance": 36}
+    keys = {f"{frame}_{name}": n for frame in ("palm", "base") for name, n in lengths.items()}
+    return (
+        wire.ObjectPose.__required_keys__ <= pose.keys() <= {"weight", *keys}
+        and _is_probability(pose["weight"])
+        and all(len(pose[key]) == keys[key] and all(map(_is_number, pose[key])) for key in pose.keys() & keys)
+    )
 
 
 def _is_number(value: object) -> bool:

@@ -14,9 +14,12 @@ from numpy.typing import NDArray
 
 from handtouch.percept.action_request import ActionRequest, ActionSelector, Question
 from handtouch.percept.friction_estimator import FrictionEstimator
+from handtouch.percept.object_estimator import ObjectEstimator
 from handtouch.percept.samples import (
     ContactBuffer,
     ContactSamples,
+    FloatArray,
+    HandSnapshot,
     IntArray,
     PerceptEstimate,
     PerceptEstimator,
@@ -54,13 +57,23 @@ class PerceptPipeline:
         buffer: ContactBuffer,
         pair_m: PairDistanceFunction | None = None,
         shear_pads: NDArray[np.bool_] | None = None,
+        surface_m: FloatArray | None = None,
     ) -> PerceptPipeline:
         """Return a pipeline of all estimators.
 
-        pair_m: see `ShapeEstimator`; shear_pads: (n,), pads above shear pads, by default none.
+        pair_m: see `ShapeEstimator`; shear_pads: (n,), pads above shear pads, by default none; surface_m: see
+        `ObjectEstimator`, by default no untouched pad is evidence.
         """
         above_shear = np.zeros(buffer.size, np.bool_) if shear_pads is None else shear_pads
-        return cls(buffer, (ShapeEstimator(buffer.size, pair_m=pair_m), FrictionEstimator(above_shear)))
+        surface_m = np.zeros((buffer.size, 0, 3)) if surface_m is None else surface_m
+        return cls(
+            buffer,
+            (
+                ShapeEstimator(buffer.size, pair_m=pair_m),
+                FrictionEstimator(above_shear),
+                ObjectEstimator(surface_m),
+            ),
+        )
 
     def set_requested(self, requested: NDArray[np.bool_], action_request_pads: NDArray[np.bool_]) -> None:
         """Set the pads of each estimator (kinds, n), rows as PERCEPT_KINDS, and those of action requests
@@ -78,9 +91,10 @@ class PerceptPipeline:
         self.action_request_pads = action_request_pads.copy()
 
     def process_tick(
-        self, sample: ContactSamples, ended: IntArray, tick_ns: int
+        self, sample: ContactSamples, ended: IntArray, tick_ns: int, snapshot: HandSnapshot | None = None
     ) -> tuple[list[PerceptEstimate], list[ActionRequest]]:
-        """Process the samples of a tick at `tick_ns`, and the pads (k,) whose contacts ended."""
+        """Process the samples of a tick at `tick_ns`, and the pads (k,) whose contacts ended; also a snapshot
+        of the hand, if the tick has one."""
         found: list[PerceptEstimate] = []
         if len(ended):
             ended = ended[self.buffer.contact_id[ended] > 0]
@@ -92,6 +106,9 @@ class PerceptPipeline:
             self.buffer.add_samples(sample)
             for estimator in self.estimators:
                 found += self._process_samples(estimator, sample)
+        if snapshot is not None:
+            for estimator in self.estimators:
+                found += estimator.process_hand(self.buffer, snapshot)
         found += self._fit_next(tick_ns)
         return found, self._select_requests(tick_ns)
 

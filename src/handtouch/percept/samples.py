@@ -1,6 +1,6 @@
 """Buffer of the latest samples of every contact, and the interface of percept estimators.
 
-Public names: `ContactBuffer`, `ContactSamples`, `FIELD_SLICES`, `FitSchedule`,
+Public names: `ContactBuffer`, `ContactSamples`, `FIELD_SLICES`, `FitSchedule`, `HandSnapshot`,
 `PerceptEstimate`, `PerceptEstimator`.
 """
 
@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from handtouch import wire
     from handtouch.percept.action_request import Question
 
 FloatArray = NDArray[np.float64]
@@ -132,6 +133,30 @@ class ContactBuffer:
         return np.asarray(values.reshape(len(pads), *SAMPLE_FIELDS[name]))
 
 
+class HandSnapshot(NamedTuple):
+    """All p pads of a hand at one time, those of rows from `first` on; NaN where unknown."""
+
+    hand: int
+    first: int
+    t_ns: int
+    contact_id: NDArray[np.uint32]
+    """(p,), 0 for none"""
+    clear: NDArray[np.bool_]
+    """(p,), sampled and untouched"""
+    slip_probability: FloatArray
+    """(p,), 0 where it isn't known"""
+    rotation: FloatArray
+    """(p, 3, 3), of the links in the palm"""
+    origin_m: FloatArray
+    """(p, 3)"""
+    base_rotation: FloatArray
+    """(3, 3), of the palm in the base"""
+    base_m: FloatArray
+    """(3,)"""
+    known_object: str
+    """name and table of the object, as in `wire.PerceptInput`"""
+
+
 class FitSchedule:
     """Schedules fits of n pads: the longest waiting first, none more often than every `period_ns`."""
 
@@ -170,6 +195,8 @@ class PerceptEstimate:
     evidence: Mapping[str, float | int] = field(default_factory=dict)
     """counts of the data used: samples, contacts, seconds"""
     reason: str = ""
+    poses: tuple[wire.ObjectPose, ...] = ()
+    """of an object, the likeliest first"""
 
 
 class PerceptEstimator:
@@ -187,6 +214,11 @@ class PerceptEstimator:
     def process_samples(self, buffer: ContactBuffer, sample: ContactSamples) -> Sequence[PerceptEstimate]:
         """Process a tick's samples of requested pads, already in the buffer; return new estimates."""
         raise NotImplementedError
+
+    def process_hand(self, buffer: ContactBuffer, snapshot: HandSnapshot) -> Sequence[PerceptEstimate]:  # noqa: ARG002
+        """Process a snapshot of a whole hand, after the samples of its tick; 20 times a second, for those
+        that need untouched pads. May take up to 25 ms."""
+        return ()
 
     def next_pad_to_fit(self, buffer: ContactBuffer, now_ns: int) -> int | None:  # noqa: ARG002
         """Return the pad most in need of a fit; None where samples suffice."""

@@ -6,22 +6,35 @@ Public name: `PerceptWorker`.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from handtouch import wire
 from handtouch.config import Deployment
 from handtouch.core.pad_model import networks_of
+from handtouch.field.surface import Surface
 from handtouch.hand import PadGeometry, mount_transform, pad_surface
 from handtouch.percept.messages import PerceptStatus, make_percept_message, make_request_message
 from handtouch.percept.pipeline import PerceptPipeline
-from handtouch.percept.samples import SAMPLE_FIELDS, ContactBuffer, ContactSamples, PerceptEstimate
+from handtouch.percept.samples import (
+    SAMPLE_FIELDS,
+    ContactBuffer,
+    ContactSamples,
+    HandSnapshot,
+    PerceptEstimate,
+)
 from handtouch.percept.shape import pair_distance
 from handtouch.wire import PERCEPT_KINDS
 
 _COLUMNS = wire.COLUMNS[wire.PerceptInput]
 _FIELDS = tuple(name for name in SAMPLE_FIELDS if name in _COLUMNS and name != "pad_noise_m2")
+_SURFACE_GRID = (0.06, 0.35, 0.65, 0.94)
+"""Places along both sides of a pad, as fractions, at which its surface is compared with an object's"""
+_STREAMED = ("object",)
+"""Kinds that are published with every estimate"""
 _STATUS_PERIOD_NS = 500_000_000
 _REPEAT_PERIOD_NS = 500_000_000
 """Period of messages while a percept doesn't change; changes are reported at once."""
@@ -41,7 +54,12 @@ class PerceptWorker:
         self.contacts = ContactBuffer(n, [self._hands.index(name) for name in names])
         """latest samples of every contact"""
         shear_pads = np.array([pad.shear is not None for pad in pads], np.bool_)
-        self._pipeline = PerceptPipeline.build(self.contacts, self.pair_distance_m, shear_pads)
+        self._pipeline = PerceptPipeline.build(
+            self.contacts,
+            self.pair_distance_m,
+            shear_pads,
+            self._surface_points([pad_surface(pad) for pad in pads]),
+        )
         self._requested = np.zeros(n, dtype=np.uint8)
         self._xy = np.full((n, 2), np.nan)  # positions of the last samples
         self._status_ns = 0
@@ -56,7 +74,10 @@ class PerceptWorker:
         before = self.contacts.contact_id[rows]
         ended = rows[(before > 0) & (before != ids)]  # also where the message of the end was lost
         percepts, requests = self._pipeline.process_tick(
-            self._read_samples(message, rows, ids), ended, message.t_ns
+            self._read_samples(message, rows, ids),
+            ended,
+            message.t_ns,
+            self._read_snapshot(message, rows, ids),
         )
         found = [
             make_percept_message(percept, self._hands[percept.hand], self._link_name(percept.pad))
@@ -115,9 +136,45 @@ class PerceptWorker:
         self._xy[pads] = _COLUMNS["xy"].to_array(message.xy)
         return sample
 
+    def _read_snapshot(
+        self, message: wire.PerceptInput, rows: NDArray[np.intp], ids: NDArray[np.uint32]
+    ) -> HandSnapshot | None:
+        if not message.link_poses:
+            return None
+        poses = _COLUMNS["link_poses"].to_array(message.link_poses)
+        base = _COLUMNS["base_pose"].to_array(message.base_pose)[0]
+        slips = np.zeros(len(rows))
+        odds = np.nan_to_num(
+            _COLUMNS["slip_log_odds"].to_array(message.slip_log_odds), nan=-np.inf, posinf=np.inf
+        )
+        slips[_COLUMNS["row"].to_array(message.row)] = expit(odds)
+        return HandSnapshot(
+            *(self._hands.index(message.hand), int(rows[0]), message.t_ns, ids),
+            _COLUMNS["clear"].to_array(message.clear).astype(np.bool_),
+            slips,
+            *(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]),
+            *(base[:9].reshape(3, 3), base[9:]),
+            message.known_object,
+        )
+
+    def _surface_points(self, surfaces: Sequence[Surface]) -> NDArray[np.float64]:
+        """Return points over each pad's surface (n, f, 3) in its link's frame; its centre where one is off
+        it."""
+        x, y = (part.ravel() for part in np.meshgrid(_SURFACE_GRID, _SURFACE_GRID))
+        found = []
+        for row, surface in enumerate(surfaces):
+            pads, none = np.full(len(x), row), np.zeros((len(x), 2, 2))
+            placed = self._placement.to_link_frame(pads, x * surface.a, y * surface.b, none).position_m
+            off = ~np.isfinite(placed).all(axis=1)
+            placed[off] = placed[len(x) // 2]
+            found.append(placed)
+        return np.stack(found)
+
     def _is_due(self, percept: PerceptEstimate) -> bool:
         key, state = (percept.kind, percept.hand, percept.pad), (percept.state, percept.label)
         last_ns, *before = self._last_reported.get(key, (-(10**18), "", ""))
+        if percept.kind in _STREAMED:
+            return True
         if tuple(before) == state and percept.estimate_ns - last_ns < _REPEAT_PERIOD_NS:
             return False
         self._last_reported[key] = percept.estimate_ns, *state

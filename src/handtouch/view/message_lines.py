@@ -147,14 +147,25 @@ def percept_line(percept: wire.Percept) -> str:
         if percept.state == "estimated"
         else f"{percept.state}: {percept.reason}"
     )
+    if percept.poses:
+        values = "; ".join([*map(pose_text, percept.poses), values])
     evidence = ", ".join(f"{_number_text(count)} {name}" for name, count in percept.evidence.items())
     return f"{head}  {result:<16}  {values}" + (f"  [{evidence}]" if evidence else "")
+
+
+def pose_text(pose: wire.ObjectPose) -> str:
+    """Format the weight of a pose, and position and z axis in the palm."""
+    x, y, z, w = pose["palm_quaternion"]
+    axis = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+    at = ", ".join(f"{1e3 * value:.1f}" for value in pose["palm_position_m"])
+    return f"{pose['weight']:.0%} at ({at}) mm, z to ({', '.join(f'{value:.2f}' for value in axis)})"
 
 
 _MAIN_VALUE = {
     "motion": "slip_distance_m",
     "shape": "radius_m",
     "friction": "ratio",
+    "object": "position_std_m",
 }
 """Kind of a percept -> its principal value."""
 _CONFIDENCE_STEP = 0.05

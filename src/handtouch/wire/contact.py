@@ -22,17 +22,21 @@ Vector3 = tuple[float, float, float]
 Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 List3 = Annotated[list[float], Vector3]
 List9 = Annotated[list[float], Matrix3]
+List4 = Annotated[list[float], tuple[float, float, float, float]]
+List36 = Annotated[list[float], tuple[(float,) * 36]]
 """Lists of so many numbers, in a map inside of a payload"""
 EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
 ContactEvent = Literal["begin", "update", "end"]
 
-PerceptKind = Literal["motion", "shape", "friction", "action_request"]
-PERCEPT_KINDS = ("motion", "shape", "friction")
+PerceptKind = Literal["motion", "shape", "friction", "object", "action_request"]
+PERCEPT_KINDS = ("motion", "shape", "friction", "object")
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""
-EXPERIMENTAL_PERCEPTS = frozenset({"shape", ACTION_REQUEST})
+EXPERIMENTAL_PERCEPTS = frozenset({"shape", "object", ACTION_REQUEST})
 """Kinds of percepts of which too little is known in the world `default` to rely on them."""
+MAX_POSES = 8
+"""Most hypotheses in `poses`"""
 
 
 class ContactPart(TypedDict):
@@ -65,6 +69,26 @@ class ContactPart(TypedDict):
     id: NotRequired[int]
     """of this one among all that the pad has had: the same while it is followed by nearness, also through
     samples in which the currents show one contact only. Both keep their order, too"""
+
+
+class ObjectPose(TypedDict):
+    """One hypothesis about the pose of a known object, in `poses`: orientations as quaternions x, y, z, w,
+    covariances (6 x 6), row by row, of position [m] and rotation vector [rad] in the named frame."""
+
+    weight: float
+    """probability of this hypothesis"""
+    palm_position_m: List3
+    """origin of the object's frame, in the palm's frame"""
+    palm_quaternion: List4
+    """orientation in the palm's frame"""
+    palm_covariance: List36
+    """covariance of both"""
+    base_position_m: NotRequired[List3]
+    """in the base's frame; absent, with the two that follow, while the palm's pose in it is unknown"""
+    base_quaternion: NotRequired[List4]
+    """orientation in the base's frame"""
+    base_covariance: NotRequired[List36]
+    """covariance of both"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,3 +300,5 @@ class Percept:
     """of an action request only: it is void from then on"""
     experimental: bool = False
     """don't rely on it: such estimates are rare, unproven or sometimes wrong in the world `default`"""
+    poses: tuple[ObjectPose, ...] = ()
+    """of an `object` only: hypotheses about its pose, the likeliest first; also while `undetermined`"""

@@ -77,3 +77,12 @@ class PerceptInput:
     """as in `contact`, of contacts above shear pads whose position is valid and whose force no lower bound"""
     force_vector_covariance_n2: Annotated[bytes, Column("<f8", 9)] = b""
     """its covariance, row by row"""
+    clear: Annotated[bytes, Column("<u1")] = b""
+    """1 for every link whose pad is sampled and untouched; this and the following are present 20 times a
+    second, while `object` is requested"""
+    link_poses: Annotated[bytes, Column("<f8", 12)] = b""
+    """of every link in the palm: rotation, row by row, and translation"""
+    base_pose: Annotated[bytes, Column("<f8", 12)] = b""
+    """of the palm in the base, alike"""
+    known_object: str = ""
+    """name and table of the object, `NAME={JSON}`; empty for none"""

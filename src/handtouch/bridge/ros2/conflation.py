@@ -11,9 +11,9 @@ from handtouch import wire
 class Conflation:
     """Waiting messages in order; `replaced` counts those that a newer one has replaced.
 
-    A contact's update and a hand frame replace the waiting one of their topic. Begins and ends of contacts,
-    health and service are never replaced. So what waits is bounded by pads, begins and ends, however slow
-    the relay is.
+    A contact's update, a hand frame and an object's pose replace the waiting one of their topic. Begins and
+    ends of contacts, health and service are never replaced. So what waits is bounded by pads, begins and
+    ends, however slow the relay is.
     """
 
     def __init__(self) -> None:
@@ -25,6 +25,7 @@ class Conflation:
         is_state = isinstance(message, wire.HandFrame) or (
             isinstance(message, wire.Contact) and message.event == "update"
         )
+        is_state = is_state or (isinstance(message, wire.Percept) and message.kind == "object")
         key = wire.topic_of(message), None if is_state else (message.session, message.seq)
         if self._waiting.pop(key, None) is not None:
             self.replaced += 1

@@ -1,8 +1,8 @@
 """The daemon's messages as ROS 2 messages.
 
 Public names: `Stamper`, `encode_contacts`, `encode_wrench`, `encode_sum`, `encode_plain_wrench`,
-`contact_markers`, `unknown_markers`, `removed_markers`, `pad_status`, `bus_status`, `daemon_status`,
-`bridge_status`.
+`object_pose`, `contact_markers`, `unknown_markers`, `removed_markers`, `pad_status`, `bus_status`,
+`daemon_status`, `bridge_status`.
 """
 
 from __future__ import annotations
@@ -173,6 +173,15 @@ def encode_plain_wrench(t_ns: int, link: str, value: float, stamper: Stamper) ->
 
 def _encode_wrench(t_ns: int, link: str, wrench: Sequence[float], stamper: Stamper) -> bytes:
     return ENCAPSULATION + _WRENCH.encode((*stamper.stamp(t_ns), stamper.frame(link), *wrench))
+
+
+def object_pose(percept: wire.Percept, palm_link: str, stamper: Stamper) -> ros.PoseWithCovarianceStamped:
+    """Return the likeliest pose of a known object, in the palm's frame."""
+    pose = percept.poses[0]
+    placed = ros.Pose(ros.Point(*pose["palm_position_m"]), ros.Quaternion(*pose["palm_quaternion"]))
+    return ros.PoseWithCovarianceStamped(
+        stamper.header(percept.t_ns, palm_link), ros.PoseWithCovariance(placed, list(pose["palm_covariance"]))
+    )
 
 
 def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> list[ros.Marker]:

@@ -101,6 +101,8 @@ class RosRelay:
         match message:
             case wire.Contact():
                 self._hand(message.hand).add_contact(message)
+            case wire.Percept():
+                self._hand(message.hand).send_object(message)
             case wire.HandFrame():
                 self._hand(message.hand).end_tick(message, self._clock_s())
             case wire.Health():
@@ -201,6 +203,7 @@ class _HandRelay:
         self._contacts = network.writer(f"{self._root}/contacts", ContactArray, Quality.STREAM)
         self._markers = network.writer(f"{self._root}/markers", ros.MarkerArray, Quality.STATE)
         self._wrenches: dict[str, RosWriter] = {}
+        self._object: RosWriter | None = None
         self._tick_contacts: list[wire.Contact] = []
         self._active: dict[str, wire.Contact] = {}
         self._known_ns: dict[str, int] = {}  # links whose last wrench isn't NaN -> time of its sample
@@ -245,6 +248,17 @@ class _HandRelay:
             self._send_sum(frame.t_ns)
         if abs(frame.t_ns - self._marked_ns) >= _MARKER_PERIOD_NS:
             self._send_markers(frame.t_ns)
+
+    def send_object(self, percept: wire.Percept) -> None:
+        """Publish the pose of the object in the hand while it is determined."""
+        if percept.kind == "object" and percept.state == "estimated" and percept.poses and self._palm_link:
+            writer = (
+                self._network.writer(f"{self._root}/object", ros.PoseWithCovarianceStamped, Quality.STREAM)
+                if self._object is None
+                else self._object
+            )
+            self._object = writer
+            writer.write(conversion.object_pose(percept, self._palm_link, self._stamper))
 
     def _update_pads(self, frame: wire.HandFrame) -> dict[str, int] | None:
         """Publish what the frame says of pads; return ids of contacts by link, None if one isn't sampled."""

@@ -57,7 +57,8 @@ def run_ros_bridge(options: RosOptions, stop: threading.Event) -> None:
     with ExitStack() as opened:
         network = RosNetwork(_domain(options.domain), options.namespace)
         stream = to_connect(settings.complete)
-        source = Subscriber[Any].open(relay.TOPICS, stream, _QUEUE_MESSAGES, options.key)
+        objects = [f"percept/{hand.name}/object" for hand in deployment.hands if hand.object]
+        source = Subscriber[Any].open((*relay.TOPICS, *objects), stream, _QUEUE_MESSAGES, options.key)
         opened.callback(source.close)
         robot = opened.enter_context(Robot(to_connect(settings.inputs), options.key))
         outgoing = relay.RosRelay(network, stamper, _palm_links(deployment))

@@ -22,7 +22,8 @@ class GraspObject:
 
     name: str
     kind: str
-    """sphere (radius), box (half sides), cylinder (radius, half length), frustum (2 radii, half length)."""
+    """sphere (radius), box (half sides), cylinder (radius, half length), frustum (2 radii, half length),
+    bolt (radius and half length of the shank, of the head), centre at half its length, head at -z."""
     size_m: tuple[float, ...]
     mass_kg: float
     position_m: Vector
@@ -43,7 +44,7 @@ class GraspObject:
             return 0.0
         if self.kind == "sphere":
             return 1 / self.size_m[0]
-        radii = self.size_m[:1] if self.kind == "cylinder" else self.size_m[:2]
+        radii = self.size_m[:2] if self.kind == "frustum" else self.size_m[:1]
         return 0.5 / float(np.mean(radii))
 
     def randomised(self, seed: int) -> GraspObject:

@@ -174,14 +174,16 @@ def _add_object(
     }
     body = spec.worldbody.add_body(name="object", **pose)
     body.add_freejoint()
-    geom = body.add_geom(name="object", mass=grasped.mass_kg)
-    geom.contype, geom.conaffinity, geom.friction[0] = (
-        _OBJECT_COLLISION_BIT,
-        _HAND_COLLISION_BIT,
-        grasped.friction,
-    )
-    geom.condim = 4
-    if grasped.kind == "frustum":
+    geom = _add_object_geom(body, grasped, "object")
+    geom.mass = grasped.mass_kg
+    if grasped.kind == "bolt":
+        radius, half_m, head_radius, half_head_m = grasped.size_m
+        geom.type, geom.mass = mujoco.mjtGeom.mjGEOM_CYLINDER, grasped.mass_kg / 2
+        geom.size[:2], geom.pos = (radius, half_m), [0.0, 0.0, half_head_m]
+        head = _add_object_geom(body, grasped, "head")
+        head.type, head.mass = mujoco.mjtGeom.mjGEOM_CYLINDER, grasped.mass_kg / 2
+        head.size[:2], head.pos = (head_radius, half_head_m), [0.0, 0.0, -half_m]
+    elif grasped.kind == "frustum":
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, "object"
         around = 2 * np.pi * np.arange(_CIRCLE_VERTICES) / _CIRCLE_VERTICES
         low, high, half_m = grasped.size_m
@@ -201,6 +203,17 @@ def _add_object(
         name2="object",
     )
     held.data[:11] = [0.0] * 10 + [1.0]  # centres coincide; the last is the weight of the rotation
+
+
+def _add_object_geom(body: Any, grasped: GraspObject, name: str) -> Any:
+    geom = body.add_geom(name=name)
+    geom.contype, geom.conaffinity, geom.friction[0] = (
+        _OBJECT_COLLISION_BIT,
+        _HAND_COLLISION_BIT,
+        grasped.friction,
+    )
+    geom.condim = 4
+    return geom
 
 
 def _add_motors(mujoco: Any, spec: Any, joints: Sequence[str], grasp_object: GraspObject) -> None:

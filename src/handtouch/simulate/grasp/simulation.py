@@ -46,6 +46,8 @@ class GraspRecord:
     """(n, p, 3), their origins in the palm's frame."""
     object_m: FloatArray
     """(n, 3), centre of the object in the palm's frame."""
+    object_rotation: FloatArray
+    """(n, 3, 3), its orientation in the palm's frame."""
     object_velocity_m_s: FloatArray
     """(n, 3), its velocity in the palm's frame."""
     object_angular_velocity_rad_s: FloatArray
@@ -68,19 +70,20 @@ class GraspRecord:
 
 def simulate_grasp(
     hand: config.HandTable,
-    name: str,
+    name: str | GraspObject,
     seed: int = 1,
     world: DrawnWorld | None = None,
     *,
     duration_s: float = DURATION_S,
     watch: Callable[[MujocoScene, int], None] = lambda *_: None,
 ) -> GraspRecord:
-    """Grasp an object of `GRASP_OBJECTS`; `world` defines the true mounting and size of the pads.
+    """Grasp an object, by its name if it is one of `GRASP_OBJECTS`; `world` defines the pads' true mounting.
 
     `watch` is called after every step, with its number. Raises KeyError for an unknown object, ValueError for
     a hand without URDF, ImportError without MuJoCo.
     """
-    scene = MujocoScene(hand, world or WORLDS["ideal"].draw(seed), GRASP_OBJECTS[name].randomised(seed))
+    grasped = GRASP_OBJECTS[name] if isinstance(name, str) else name
+    scene = MujocoScene(hand, world or WORLDS["ideal"].draw(seed), grasped.randomised(seed))
     controller = _GraspController(scene, seed)
     recorder = _GraspRecorder(scene, round(duration_s / TIME_STEP_S))
     for number in range(recorder.step_count):
@@ -137,6 +140,7 @@ class _GraspRecorder:
         p = len(scene.pads)
         self._bodies = np.array([pad.body_id for pad in scene.pads])
         self._joint_rad = np.empty((n, len(scene.joint_qpos)))
+        self._object_rotation = np.empty((n, 3, 3))
         self._rotation, self._link_m = np.empty((n, p, 3, 3)), np.empty((n, p, 3))
         self._object_m, self._object_velocity_m_s, self._object_angular_velocity_rad_s = (
             np.empty((n, 3)) for _ in range(3)
@@ -159,6 +163,7 @@ class _GraspRecorder:
         # poses and contacts in `data` are now those of the begin of the step, as the recorded qpos
         self._rotation[number] = data.xmat[self._bodies].reshape(-1, 3, 3)
         self._link_m[number], self._object_m[number] = data.xpos[self._bodies], data.xpos[scene.object_body]
+        self._object_rotation[number] = data.xmat[scene.object_body].reshape(3, 3)
         for body, row, point_m, force_n, penetration_m in hand_contacts(scene):
             self._rows.append((number, row, body))
             self._points.append((point_m, force_n))
@@ -179,6 +184,7 @@ class _GraspRecorder:
             np.asarray(rotation.T @ self._rotation, np.float64),
             scene.to_palm(self._link_m),
             scene.to_palm(self._object_m),
+            np.asarray(rotation.T @ self._object_rotation, np.float64),
             self._object_velocity_m_s @ rotation,
             self._object_angular_velocity_rad_s @ rotation,
             self._held_externally,

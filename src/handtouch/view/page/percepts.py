@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from handtouch import wire
 from handtouch.view.message_lines import percept_summary
 
-_KINDS = ("motion", "shape", "friction")
+_KINDS = ("motion", "shape", "friction", "object")
 _DEFAULT_LABELS = ("sticking", "point")
 """Usual classes: listed, but not shown next to the pad."""
 _PERCEPT_TIMEOUT_NS = 3_000_000_000
