@@ -117,7 +117,7 @@ class Starter:
 
     def close(self) -> None:
         self._socket.close()
-        self._process.wait(10)
+        self._process.wait(60)
 
 
 def _serve(requests: socket.socket) -> None:

@@ -94,18 +94,24 @@ def simulate(
     return diagnosis.diagnoses()
 
 
-def fractions(x: float, y: float) -> Counts:
-    network = model().networks[0]
+@lru_cache(maxsize=4096)
+def fractions(x: float, y: float, series_ohm: tuple[float, ...] = (0.0,) * 4) -> Counts:
+    """Return the shares of the electrodes; kept, as a contact has them for many samples."""
+    network = model().networks[0].with_series_ohm(series_ohm)
     return np.asarray(network.fractions(x * network.a, y * network.b))
 
 
-def presses(t: float) -> Counts:
-    """One a second, half a second long, anywhere: the same at the same time."""
-    number, part = divmod(t, 1.0)
-    if part > 0.5:
-        return np.zeros(4)
-    rng = np.random.default_rng(int(number))
+@lru_cache(maxsize=4096)
+def press(number: int) -> Counts:
+    """Return the counts of a press anywhere: the same for the same number."""
+    rng = np.random.default_rng(number)
     return np.asarray(fractions(*rng.uniform(0.1, 0.9, 2)) * np.exp(rng.uniform(6, 9)))
+
+
+def presses(t: float) -> Counts:
+    """One a second, half a second long: the same at the same time."""
+    number, part = divmod(t, 1.0)
+    return np.zeros(4) if part > 0.5 else press(int(number))
 
 
 def test_ordinary_presses_give_no_diagnosis() -> None:
@@ -352,14 +358,10 @@ def test_moisture_ends_when_the_pad_has_dried() -> None:
 
 
 def test_open_electrode_is_a_dead_electrode() -> None:
-    network = model().networks[0]
-    broken = network.with_series_ohm([0, 0, np.inf, 0])
-
     def read(t: float, _: np.random.Generator) -> Counts:
         number, part = divmod(t, 1.0)
-        rng = np.random.default_rng(int(number))
-        x, y = rng.uniform(0.1, 0.9, 2)
-        return broken.fractions(x * network.a, y * network.b) * 3000 * (part < 0.5)
+        place = np.random.default_rng(int(number)).uniform(0.1, 0.9, 2)
+        return np.asarray(fractions(*place, (0, 0, np.inf, 0)) * 3000 * (part < 0.5))
 
     diagnosis, _ = play(read, 40)
     assert [(f.kind, f.electrodes) for f in diagnosis.diagnoses()] == [(FaultKind.DEAD_ELECTRODE, ("y0",))]
@@ -367,14 +369,11 @@ def test_open_electrode_is_a_dead_electrode() -> None:
 
 def loose(t: float, until_s: float = np.inf) -> Counts:
     """Presses of half a second; xa opens and closes in each of them, from 3 s on."""
-    network = model().networks[0]
     part = t % 1.0
     if not (3 < t < until_s and 0.2 < part < 0.35) or part > 0.5:
         return presses(t)
     rng = np.random.default_rng(int(t))
-    x, y = rng.uniform(0.1, 0.9, 2)
-    broken = network.with_series_ohm([0, np.inf, 0, 0])
-    shares = np.asarray(broken.fractions(x * network.a, y * network.b))
+    shares = fractions(*rng.uniform(0.1, 0.9, 2), (0, np.inf, 0, 0))
     return np.asarray(shares * 0.95 * np.exp(rng.uniform(6, 9)))
 
 
@@ -389,15 +388,12 @@ def test_electrode_that_opens_and_closes_is_a_dead_electrode_part_of_the_time() 
 
 def test_electrode_that_opens_under_a_contact_and_stays_open_is_dead() -> None:
     """Also where contacts would be those of a healthy pad: far from it."""
-    network = model().networks[0]
-    broken = network.with_series_ohm([0, np.inf, 0, 0])
 
     def contacts(t: float, _: np.random.Generator) -> Counts:
         if t % 1.0 > 0.5:
             return np.zeros(4)
-        x, y = np.random.default_rng(int(t)).uniform(0.1, 0.5 if t > 11 else 0.9, 2)
-        pad = broken if t > 10.2 else network
-        return np.asarray(pad.fractions(x * network.a, y * network.b) * 3000)
+        place = np.random.default_rng(int(t)).uniform(0.1, 0.5 if t > 11 else 0.9, 2)
+        return np.asarray(fractions(*place, (0, np.inf if t > 10.2 else 0, 0, 0)) * 3000)
 
     _, changes = play(contacts, 20)
     (found,) = changes
