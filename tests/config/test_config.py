@@ -81,10 +81,29 @@ DEPLOYMENTS = [path for path in sorted(CONFIG.glob("*.toml")) if "\n[[hand]]\n" 
 @pytest.mark.parametrize("path", DEPLOYMENTS, ids=lambda path: path.name)
 def test_shipped_deployments_are_valid(path: Path) -> None:
     deployment = config.load(path)
-    pads = {"two_finger": 2, "electrodes": 2, "switched": 2, "outlined": 3, "shear": 2, "l_palm": 1}.get(
-        path.stem, 15
-    )
+    pads = {
+        "two_finger": 2,
+        "electrodes": 2,
+        "switched": 2,
+        "outlined": 3,
+        "shear": 2,
+        "l_palm": 1,
+        "fingertip": 1,
+    }.get(path.stem, 15)
     assert [len(hand.pads) for hand in deployment.hands] == [pads]
+
+
+def test_a_deployment_holds_the_files_of_its_surfaces(tmp_path: Path) -> None:
+    for name in ("fingertip.toml", "fingertip.stl"):
+        (tmp_path / name).write_bytes(shipped.path(name).read_bytes())
+    deployment = config.load(tmp_path / "fingertip.toml")
+    (tmp_path / "fingertip.stl").unlink()
+    config.surfaces._build.cache_clear()
+    sent = config.Deployment.model_validate_json(deployment.model_dump_json(by_alias=True))
+    assert sent == deployment
+    assert sent.pads[0].pad.surface.build().extent_m[0] == pytest.approx(0.0244, abs=1e-4)
+    with pytest.raises(ConfigError, match=r"surface.file = .*: No such file"):
+        config.load(tmp_path / "fingertip.toml")
 
 
 def test_shipped_pads_have_moderate_aspect_ratios() -> None:

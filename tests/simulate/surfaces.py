@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from handtouch.config import surface_table
+from handtouch.config import shipped, surface_table
 
 _BULGE_MM = 8 / math.sin(math.radians(75)) * math.radians(150)
 
@@ -56,3 +56,12 @@ OUTLINE_TABLES = {
     ),
 }
 """Pads of any outline."""
+
+MESH_TABLE = surface_table(
+    "mesh",
+    file=str(shipped.path("fingertip.stl")),
+    corner_x_mm=(5.2, 22.8, 22.8, 5.2),
+    corner_y_mm=(-6.0, -4.8, 4.8, 6.0),
+    corner_z_mm=(3.0, 3.0, 3.0, 3.0),
+)
+"""The shipped fingertip."""

@@ -11,14 +11,15 @@ from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.torn_sheet import cut_sheet_maps
-from tests.simulate.surfaces import OUTLINE_TABLES, SURFACE_TABLES
+from tests.simulate.surfaces import MESH_TABLE, OUTLINE_TABLES, SURFACE_TABLES
 
 POSITIONS = [(0.0, 0.0), (0.5, 0.5), (0.02, 0.9), (0.7, 0.3), (1.0, 1.0)]
 tables = pytest.mark.parametrize("table", SURFACE_TABLES.values(), ids=list(SURFACE_TABLES))
 
 
 def test_every_surface_of_a_deployment_can_be_simulated() -> None:
-    assert {table.kind for table in (SURFACE_TABLES | OUTLINE_TABLES).values()} == set(SURFACES)
+    tables = *SURFACE_TABLES.values(), *OUTLINE_TABLES.values(), MESH_TABLE
+    assert {table.kind for table in tables} == set(SURFACES)
 
 
 @tables

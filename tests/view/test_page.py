@@ -29,7 +29,8 @@ from handtouch.field.surface import (
     SphereSurface,
     Surface,
 )
-from handtouch.hand import pad_surface
+from handtouch.field.triangulation import parse_stl
+from handtouch.hand import mount_transform, pad_surface
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import BodyShape, read_urdf
 from handtouch.view.page.meshes import body_mesh, outline_m, pad_mesh
@@ -86,6 +87,18 @@ def deployed(deployment: config.Deployment = DEPLOYMENT, run: int = 1) -> wire.C
 def message_lines(model: PageModel) -> list[str]:
     lines = model.values.changes_since(0).get("messages", ())
     return [f"{', '.join(line['links'])}: {line['text']}" for line in lines]
+
+
+def test_a_pad_of_an_stl_file_is_drawn_where_its_triangles_are() -> None:
+    """Also on a machine without the file: the deployment holds it."""
+    deployment = config.load(shipped.path("fingertip.toml"))
+    pad = deployment.pads[0].pad
+    drawn = pad_mesh(pad_surface(pad), *mount_transform(pad)).corners_m
+    vertices = 1e-3 * parse_stl(shipped.path("fingertip.stl").read_bytes()).points
+    away_m = np.linalg.norm(vertices[:, None] - drawn, axis=2)
+    assert away_m.min(axis=0).max() < 1.2e-3  # every corner is near a vertex; these are 1 to 2 mm apart
+    assert away_m.min(axis=1).max() < 1.8e-3
+    assert len(scene_of(deployment, {})["pads"]) == 1
 
 
 def test_a_daemon_that_is_late_is_shown_with_the_rate_that_it_should_have() -> None:

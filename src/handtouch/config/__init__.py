@@ -22,7 +22,7 @@ from handtouch.config.checks import problems_in, problems_in_buses
 from handtouch.config.objects import ObjectTable
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.shear import Shear
-from handtouch.config.surfaces import SurfaceTable, surface_table
+from handtouch.config.surfaces import SurfaceTable, film_of, surface_table
 from handtouch.config.tables import (
     KINDS,
     TABLES,
@@ -39,6 +39,7 @@ from handtouch.config.tables import (
     Touch,
 )
 from handtouch.config.toml_text import parse_toml, read_text
+from handtouch.field.embedded_file import embed_file
 
 __all__ = [
     "Behaviour",
@@ -58,6 +59,7 @@ __all__ = [
     "SurfaceTable",
     "Table",
     "Touch",
+    "film_of",
     "json_schema",
     "load",
     "parse",
@@ -95,7 +97,12 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
         for name, node in deployment.nodes.items()
     }
     hands = tuple(
-        hand.model_copy(update={"urdf": _resolve_path(hand.urdf, folder or Path())}) if hand.urdf else hand
+        hand.model_copy(
+            update={
+                "urdf": _resolve_path(hand.urdf, folder or Path()) if hand.urdf else None,
+                "pads": tuple(_with_embedded_files(pad, folder or Path()) for pad in hand.pads),
+            }
+        )
         for hand in deployment.hands
     )
     objects = {
@@ -203,6 +210,17 @@ def _resolve_path(name: str, folder: Path) -> str:
         with contextlib.suppress(FileNotFoundError):
             return str(shipped.path(name))
     return str(folder / name)
+
+
+def _with_embedded_files(pad: Pad, folder: Path) -> Pad:
+    """Return a pad with the content of the files that it names."""
+    film = pad.resistance_map
+    return pad.model_copy(
+        update={
+            "surface": pad.surface.with_embedded_files(folder),
+            "resistance_map": embed_file(film, folder) if film else None,
+        }
+    )
 
 
 def _check_deployment(deployment: Deployment, file: str) -> Deployment:

@@ -11,8 +11,11 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from handtouch.config.problems import Problem, suggest_name
 from handtouch.config.shear import Shear
+from handtouch.config.surfaces import film_of
 from handtouch.config.tables import (
     MAX_ELECTRODES,
     MIN_ELECTRODES,
@@ -26,12 +29,15 @@ from handtouch.config.tables import (
 )
 from handtouch.config.units import pad_unit_problems, unit_problems
 from handtouch.field.outline import MIN_CLEARANCE
-from handtouch.field.outline_surface import OutlineSurface
+from handtouch.field.surface_base import SURFACES, surface_keys
 from handtouch.host.endpoints import is_loopback
 
 UDP_MULTICAST_PORT = 43113
 """python-can's default port of a udp_multicast bus."""
 _SURFACES_ABOVE_SHEAR = ("plane", "cylinder", "cone", "sphere", "revolution")
+_MAX_VALUE_LENGTH = 60  # of a text in an error: embedded files are longer
+_MAX_BESIDE = 0.2  # of a side, that places where a film was measured may be beside the pad
+_MAX_MEAN_RATIO = 1.5  # of a film's mean resistance and the stated one: three standard deviations of films
 _MAX_OVERLAP_MM = 1e-6  # rounding where arcs end in one point
 
 
@@ -57,7 +63,7 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             location = f'[[hand.pad]] {number} "{name}": '
             yield from _check_references(location, pad, deployment)
             in_wrong_unit = list(pad_unit_problems(location, pad))
-            yield from in_wrong_unit or _check_shape(location, pad)
+            yield from in_wrong_unit or _check_shape(location, pad, deployment)
             yield from _check_electrodes(location, pad, deployment)
             yield from _check_schedule(location, pad, deployment)
             yield from _check_shear_pad(location, pad)
@@ -378,16 +384,16 @@ def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:
     """Check that electrodes on arcs follow each other along the outline of a pad with possible gaps."""
     key, value = f"{location}electrode_arcs_mm", _format_value(pad.electrode_arcs_mm)
     surface = pad.surface.build()
-    if not isinstance(surface, OutlineSurface):
-        yield Problem(key, value, "only pads with an outline have arcs; leave it out")
+    if surface.perimeter_m is None:
+        yield Problem(key, value, "only pads with an outline or on a mesh have arcs; leave it out")
         return
     if not MIN_ELECTRODES <= len(pad.arcs_mm) <= MAX_ELECTRODES:
         remedy = f"names {len(pad.arcs_mm)} electrodes; {MIN_ELECTRODES} to {MAX_ELECTRODES} are supported"
         yield Problem(key, value, remedy)
         return
-    whole = 1e3 * surface.outline.perimeter()
+    whole = 1e3 * surface.perimeter_m
     if any(not -whole < end < 2 * whole for arc in pad.arcs_mm for end in arc):
-        yield Problem(key, value, f"the outline is {whole:.5g} mm long; lengths must be within it")
+        yield Problem(key, value, f"the edge is {whole:.5g} mm long; lengths must be within it")
         return
     first = pad.arcs_mm[0][0]
     lengths = [(stop - start) % whole for start, stop in pad.arcs_mm]
@@ -409,7 +415,35 @@ def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:
             yield Problem(key, value, f"{name} and {after} touch or overlap; leave a gap between them")
 
 
-def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
+def _check_film(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
+    """Check the file of a film's measured resistance, and that it is of this pad."""
+    if pad.resistance_map is None:
+        return
+    key, value = f"{location}resistance_map", _format_value(pad.resistance_map)
+    try:
+        film = film_of(pad.resistance_map)
+    except ValueError as error:
+        yield Problem(key, value, str(error))
+        return
+    is_mesh = any(shape.is_file for shape in surface_keys(SURFACES[pad.surface.kind]).values())
+    if is_mesh != (film.place_m.shape[1] == 3):
+        missing = "needs z_mm: places in the frame of its STL file"
+        yield Problem(key, value, missing if is_mesh else "has z_mm, which is for meshes")
+        return
+    place = film.fractions(pad.surface.build())
+    if not ((place > -_MAX_BESIDE) & (place < 1 + _MAX_BESIDE)).all():
+        away = int(np.abs(place - 0.5).max(axis=1).argmax())
+        remedy = f"place {away + 1} isn't on the pad; x_mm and y_mm are millimetres from electrodes x0 and y0"
+        yield Problem(key, value, remedy)
+    if (sheet := deployment.sheets.get(pad.sheet)) is None:
+        return
+    ratio = float(np.exp(np.mean(np.log(film.ohm_per_square)))) / sheet.ohm_per_square
+    if not 1 / _MAX_MEAN_RATIO < ratio < _MAX_MEAN_RATIO:
+        remedy = f"its mean is {ratio:.3g} of ohm_per_square of [sheet.{pad.sheet}]; state that as measured"
+        yield Problem(key, value, remedy)
+
+
+def _check_shape(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
     """Check that a pad's surface, gaps and series resistors are possible."""
     surface = pad.surface
     problems = list(surface.problems())
@@ -418,6 +452,7 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
         yield Problem(f"{location}surface.{key or 'kind'}", _format_value(value), remedy)
     if problems:
         return
+    yield from _check_film(location, pad, deployment)
     if pad.electrode_arcs_mm is not None:
         yield from _check_arcs(location, pad)
         return
@@ -447,4 +482,6 @@ def _check_shape(location: str, pad: Pad) -> Iterator[Problem]:
 
 
 def _format_value(value: object) -> str:
+    if isinstance(value, str) and len(value) > _MAX_VALUE_LENGTH:
+        value = f"{value[:_MAX_VALUE_LENGTH]}..."
     return f" = {json.dumps(value, ensure_ascii=False)}"

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union
 
 from pydantic import Field, TypeAdapter, create_model
 
 from handtouch.config.base import Table
+from handtouch.field.embedded_file import embed_file, read_embedded
+from handtouch.field.film import Film
 from handtouch.field.surface import SURFACES, AnisotropicSurface, Surface
 from handtouch.field.surface_base import SurfaceKey, surface_keys
+from handtouch.field.triangulation import Triangulation, parse_stl
 from handtouch.host.plugins import load_plugins
 
 load_plugins("handtouch.surfaces", Surface)  # classes that name a kind register themselves
@@ -46,6 +50,11 @@ class SurfaceTable(Table):
         """Sides (a, b) [mm] of the conformal rectangle."""
         surface = self.build()
         return surface.a * 1e3, surface.b * 1e3
+
+    def with_embedded_files(self, folder: Path) -> Self:
+        """Return the table with the content of the files that it names, relative to `folder`."""
+        names = [key.name for key in surface_keys(SURFACES[self.kind]).values() if key.is_file]
+        return self.model_copy(update={name: embed_file(getattr(self, name), folder) for name in names})
 
     def problems(self) -> Iterator[tuple[str, str]]:
         """Yield (key, remedy) for every reason why no such surface exists; key "" for the whole table."""
@@ -80,6 +89,8 @@ def _key_field(key: SurfaceKey) -> tuple[Any, Any]:
     """Return type and pydantic field of a key."""
     number = Annotated[float, Field(gt=key.above, lt=key.below, le=key.at_most)]
     examples = None if key.example is None else [key.example]
+    if key.is_file:
+        return str, Field(min_length=1, description=key.description, examples=examples)
     if key.is_list:
         numbers = Annotated[tuple[number, ...], Field(strict=False, min_length=2)]
         return numbers, Field(description=key.description, examples=examples)
@@ -105,6 +116,22 @@ if TYPE_CHECKING:
     PadSurface = SurfaceTable
 else:
     PadSurface = Annotated[Union[tuple(SURFACE_TABLES.values())], Field(discriminator="kind")]  # noqa: UP007
+
+SurfaceTriangles = Triangulation
+"""The triangles of a file, which the simulator builds a geometry of its own from."""
+
+
+def surface_triangles(file: str, metres_per_unit: float) -> SurfaceTriangles:
+    """Return the triangles [m] of an STL file, by its path or embedded. Raises ValueError."""
+    surface = parse_stl(read_embedded(file))
+    return Triangulation(metres_per_unit * surface.points, surface.triangles)
+
+
+@lru_cache(maxsize=64)
+def film_of(file: str) -> Film:
+    """Return the measured film of a file, by its path or embedded. Raises ValueError."""
+    return Film(read_embedded(file))
+
 
 _ADAPTER: TypeAdapter[SurfaceTable] = TypeAdapter(PadSurface)
 

@@ -470,9 +470,10 @@ class Pad(Table):
     )
     electrode_arcs_mm: dict[Name, Arc] | None = Field(
         None,
-        description="of a pad with an outline, names of 3 to 16 electrodes in the order in which they follow "
-        "each other counter-clockwise, each with the part of the outline that it covers, less gap_mm at both "
-        "ends: lengths along it from the first vertex; default: one electrode between each two of corners_mm",
+        description="of a pad with an outline or on a mesh, names of 3 to 16 electrodes in the order in "
+        "which they follow each other counter-clockwise, each with the part of the edge that it covers, less "
+        "gap_mm at both ends: lengths along it from the first vertex, on a mesh from the first corner; "
+        "default: one electrode between each two corners",
     )
     switch_states: tuple[SwitchState, ...] | None = Field(
         None,
@@ -486,6 +487,14 @@ class Pad(Table):
     )
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
     surface: PadSurface = Field(description="shape of the sensing surface")
+    resistance_map: str | None = Field(
+        None,
+        min_length=1,
+        description="NumPy archive (.npz) of the sheet resistance as measured on this pad's film, relative "
+        "to this file: x_mm, y_mm (lengths along the film from electrodes x0 and y0; on a mesh with z_mm the "
+        "coordinates of its file) and ohm_per_square, one value for each place; default: the same everywhere",
+        examples=["film.npz"],
+    )
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
     gap_offsets_mm: Annotated[tuple[Ends, ...], _PerChannel] = Field(
         ((0.0, 0.0),) * 4,

@@ -120,6 +120,7 @@ def _table_key(network: ElectrodeNetwork) -> str:
         network.sheet_ohm_per_square,
         network.series_ohm,
         network.states,
+        network.film_digest,
         np.__version__,
         _code_hash(),
     )

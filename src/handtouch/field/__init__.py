@@ -21,6 +21,7 @@ from handtouch.field.surface import (
     AnisotropicSurface,
     ConeSurface,
     CylinderSurface,
+    MeshSurface,
     PlaneSurface,
     PrismSurface,
     RevolutionSurface,
@@ -29,7 +30,6 @@ from handtouch.field.surface import (
 )
 
 if TYPE_CHECKING:
-    from handtouch.field.mesh_network import MeshNetwork, read_stl
     from handtouch.field.residual import PointTest, point_test, resolvable_separation
     from handtouch.field.sandwich import Sandwich, SandwichEstimate
 
@@ -45,7 +45,7 @@ __all__ = [
     "ForceEstimateStatus",
     "ForwardModel",
     "Location",
-    "MeshNetwork",
+    "MeshSurface",
     "Outline",
     "OutlineNetwork",
     "PlaneSurface",
@@ -61,12 +61,10 @@ __all__ = [
     "contact_stack_resistance",
     "estimate",
     "point_test",
-    "read_stl",
     "resolvable_separation",
 ]
 
 _LATER = {
-    **dict.fromkeys(("MeshNetwork", "read_stl"), "mesh_network"),
     **dict.fromkeys(("PointTest", "point_test", "resolvable_separation"), "residual"),
     **dict.fromkeys(("Sandwich", "SandwichEstimate"), "sandwich"),
 }

@@ -157,6 +157,11 @@ class ElectrodeNetwork(GroundedElectrodes):
         return network
 
     @property
+    def film_digest(self) -> str:
+        """Name of a film of varying sheet resistance; empty for an even one."""
+        return ""
+
+    @property
     def a(self) -> float:
         """Length along x, from side x0 to xa."""
         return self._rectangle.a

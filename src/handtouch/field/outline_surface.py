@@ -143,11 +143,11 @@ class OutlineSurface(Surface):
         start, stop = (x if side in ("y0", "yb") else y).tolist()
         return start, stop
 
-    def perimeter_positions(self, ends_m: npt.ArrayLike) -> FloatArray:
-        """Return electrodes on arcs (m, 2) of the outline [m] as `ElectrodeNetwork.from_arcs` takes them.
+    @property
+    def perimeter_m(self) -> float:
+        return self.outline.perimeter()
 
-        Begin and end of each, counter-clockwise; positions on the outline are modulo its length.
-        """
+    def perimeter_positions(self, ends_m: npt.ArrayLike) -> FloatArray:
         length = self.outline.perimeter()
         found: list[float] = []
         whole, begins = 2 * (self.a + self.b), np.cumsum([0.0, self.a, self.b, self.a])

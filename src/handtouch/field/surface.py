@@ -38,6 +38,7 @@ import numpy.typing as npt
 
 from handtouch.field._prism import PrismSurface
 from handtouch.field._revolution import RevolutionSurface
+from handtouch.field.mesh_surface import MeshSurface
 from handtouch.field.outline_surface import OutlineOnCylinder, OutlineOnSphere, OutlineSurface
 from handtouch.field.surface_base import (
     SURFACES,
@@ -57,6 +58,7 @@ __all__ = [
     "AnisotropicSurface",
     "ConeSurface",
     "CylinderSurface",
+    "MeshSurface",
     "OutlineOnCylinder",
     "OutlineOnSphere",
     "OutlineSurface",
@@ -373,6 +375,18 @@ class AnisotropicSurface(Surface):
 
     def describe_side(self, side: str) -> str:
         return self.surface.describe_side(side)
+
+    @property
+    def frame(self) -> tuple[FloatArray, FloatArray]:
+        return self.surface.frame
+
+    def electrode_span(self, side: str, low_m: float, high_m: float) -> tuple[float, float]:
+        factor = self._stretch if side in ("y0", "yb") else 1.0
+        start, stop = self.surface.electrode_span(side, low_m, high_m)
+        return factor * start, factor * stop
+
+    def side_lengths_m(self) -> tuple[float, float, float]:
+        return self.surface.side_lengths_m()
 
     def from_rectangle(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         return self.surface.from_rectangle(self._unstretched(x), y)

@@ -31,7 +31,8 @@ class SurfaceKey:
     """One key of a surface's table in a deployment file; the ending of its name is its unit, mm or deg.
 
     above, below: exclusive bounds; at_most: inclusive bound, all in the key's unit. is_list: the value is a
-    list of numbers. example: a value for the reference of keys, where no shipped file has one.
+    list of numbers. is_file: it is the path of a file, see `embedded_file`. example: a value for the
+    reference of keys, where no shipped file has one.
     """
 
     name: str
@@ -40,10 +41,13 @@ class SurfaceKey:
     below: float | None = None
     at_most: float | None = None
     is_list: bool = False
+    is_file: bool = False
     example: Any = None
 
     def to_si(self, value: Any) -> Any:
         """Return a value of the file, or each of a list, in metres or radians."""
+        if self.is_file:
+            return value
         scale = _SI_PER_UNIT[self.name.rpartition("_")[2]]
         return tuple(scale * number for number in value) if self.is_list else scale * value
 
@@ -56,10 +60,11 @@ def surface_key(
     below: float | None = None,
     at_most: float | None = None,
     is_list: bool = False,
+    is_file: bool = False,
     example: Any = None,
 ) -> Any:
     """Return the dataclass field of a surface whose value a deployment file gives under the key `name`."""
-    key = SurfaceKey(name, description, above, below, at_most, is_list, example)
+    key = SurfaceKey(name, description, above, below, at_most, is_list, is_file, example)
     return dataclasses.field(metadata={"surface_key": key})
 
 
@@ -126,6 +131,12 @@ class Surface(ABC):
         """Coordinates y, increasing, of folds along x, at which the normal jumps; empty if there are none."""
         return np.zeros(0)
 
+    @property
+    def frame(self) -> tuple[FloatArray, FloatArray]:
+        """Axes, the columns of (3, 3), and origin (3,) [m] of the pad frame in the frame that a mount is
+        stated for; the same frame but for surfaces that are drawn in one of their own."""
+        return np.eye(3), np.zeros(3)
+
     def describe_side(self, side: str) -> str:
         """Return what an operator sees at side x0, xa, y0 or yb: an edge, an end, a tip."""
         return "the end" if side in ("x0", "xa") else "the side"
@@ -157,6 +168,18 @@ class Surface(ABC):
         """Return the lengths along the surface of the profile and of the sides x0 and xa [m]."""
         _, lengths = self.from_rectangle([0.0, self.a], [self.b, self.b])
         return self.extent_m[0], float(lengths[0]), float(lengths[1])
+
+    @property
+    def perimeter_m(self) -> float | None:
+        """Length of the edge, of surfaces on which electrodes may lie on any parts of it; None for others."""
+        return None
+
+    def perimeter_positions(self, ends_m: npt.ArrayLike) -> FloatArray:
+        """Return electrodes on arcs (m, 2) of the edge [m] as `ElectrodeNetwork.from_arcs` takes them.
+
+        Begin and end of each, counter-clockwise; positions on the edge are modulo its length.
+        """
+        raise NotImplementedError
 
     @property
     @abstractmethod

@@ -16,7 +16,6 @@ from handtouch import config
 from handtouch.field.contact_law import ContactLaw
 from handtouch.field.model import FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
-from handtouch.field.outline_surface import OutlineSurface
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
@@ -32,14 +31,16 @@ def pad_surface(pad: config.Pad) -> Surface:
 
 def mount_transform(pad: config.Pad) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation (3, 3) and translation (3,) [m] from the pad frame to its link frame."""
-    return rotation_from_rpy(np.radians(pad.mount.rpy_deg)), np.array(pad.mount.position_mm) * _M_PER_MM
+    turn, at = rotation_from_rpy(np.radians(pad.mount.rpy_deg)), np.array(pad.mount.position_mm) * _M_PER_MM
+    axes, origin = pad_surface(pad).frame
+    return turn @ axes, at + turn @ origin
 
 
 class MountUncertainty:
     """Uncertainty of the mounts of a hand's pads on their links."""
 
     def __init__(self, hand: config.HandTable) -> None:
-        self.origin_m = np.array([pad.mount.position_mm for pad in hand.pads]) * _M_PER_MM
+        self.origin_m = np.array([mount_transform(pad)[1] for pad in hand.pads])
         """(n, 3) of the pads on their links"""
         self.position_variance_m2 = (hand.mount_std_mm * _M_PER_MM) ** 2
         """along each axis"""
@@ -58,7 +59,7 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
 
 def network_parameters(pad: config.Pad) -> tuple[object, ...]:
     """Return what `pad_network` depends on, but for the sheet: pads with the same share a network."""
-    return pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
+    return pad.surface, pad.resistance_map, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
 
 
 def pad_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
@@ -67,12 +68,24 @@ def pad_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
     if not pad.arcs_mm:
         return electrode_network(pad, sheet)
     surface = pad_surface(pad)
-    if not isinstance(surface, OutlineSurface):
-        raise ValueError("electrode_arcs_mm: only pads with an outline have arcs")
+    if surface.perimeter_m is None:
+        raise ValueError("electrode_arcs_mm: only pads with an outline or on a mesh have arcs")
     ends_m = _M_PER_MM * (np.array(pad.arcs_mm) + np.array(pad.gaps_mm) * (1.0, -1.0))
     spans = surface.perimeter_positions(ends_m)
     network = ElectrodeNetwork.from_arcs(surface.a, surface.b, spans, sheet.ohm_per_square, pad.series_ohm)
-    return network.switched(pad.state_numbers) if pad.switch_states else network
+    return _on_film(network.switched(pad.state_numbers) if pad.switch_states else network, pad, sheet)
+
+
+def _on_film(network: ElectrodeNetwork, pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
+    """Return a pad's network on its film, if its resistance was measured."""
+    if pad.resistance_map is None:
+        return network
+    from handtouch.field.film import UnevenNetwork  # not loaded with the package
+
+    surface = pad_surface(pad)
+    scale = float(surface.scale(surface.a / 2, surface.b / 2))
+    radius = _M_PER_MM * sheet.contact_radius_mm / scale
+    return UnevenNetwork.on_film(network, config.film_of(pad.resistance_map), surface, radius)
 
 
 def sheet_law(
@@ -109,9 +122,10 @@ def electrode_network(
         factor = stretch if side in ("y0", "yb") else 1.0
         start, stop = surface.electrode_span(side, low_m, high_m)
         electrodes.append(Electrode(side, factor * start, factor * stop))
-    return ElectrodeNetwork.from_sides(
+    network = ElectrodeNetwork.from_sides(
         stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )
+    return _on_film(network, pad, sheet)
 
 
 def models_with_other_parts(

@@ -273,6 +273,9 @@ def _mount_problems(
         key, problem, remedy = "rpy_deg", f"the pad faces into {body}", "its z axis points outward"
     else:
         return
+    if pad.surface.build().frame[1].any():  # drawn in a frame of its own, for which the mount is stated
+        yield Problem(f"{at}mount.{key}", _value_text(getattr(pad.mount, key)), f"{problem}; {remedy}")
+        return
     nearest = _nearest_mount(rotation, middle, shapes, folder)
     if pad.mount.model_fields_set & {"position_mm", "rpy_deg"}:
         given = _value_text(getattr(pad.mount, key))

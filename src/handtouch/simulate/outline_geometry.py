@@ -201,6 +201,12 @@ class SimulatedOutline(SimulatedSurface):
         x, y = self.drawing(np.array([[s_m / self.length_m], [phi / self.arc]]))[0][:, 0]
         return float(x - self.grown[0] * self._bounds[0]), float(y - self.grown[1] * self._bounds[1])
 
+    def film_fractions(self, place_m: FloatArray) -> FloatArray:
+        """Return the fractions (n, 2) of places (n, 2) of the drawing, as `arc_lengths` counts them."""
+        x0, y0, x1, y1 = self._bounds
+        middle = np.array([x1 - x0, y1 - y0]) / 2
+        return self._fractions_at((place_m - middle).T).T
+
     def metres_per_fraction(self, x: float, y: float) -> FloatArray:
         """Return the derivatives (2, 2) of positions along the surface by the fractions of the pad."""
         position = np.array([[x], [y]])

@@ -1,6 +1,6 @@
 """Solve the potential of a sheet of any outline by finite elements: the simulator's forward model for them.
 
-Public names: `solve_outline` -> `SheetMaps`, `outline_mutual_resistance`.
+Public names: `solve_outline` -> `SheetMaps`, `outline_mutual_resistance`; `log_radius_table`.
 
 The sheet's equation is solved on the square that the transfinite map of `SimulatedOutline` takes to the pad,
 where it has the conductivity tensor det J (J' J)^-1. Elements are products of one-dimensional ones, graded
@@ -36,9 +36,12 @@ _MIN_ARC_FRACTION = 1e-4  # part of an electrode over a side; shorter ones are l
 _MIN_STATIC_TIMES = 20
 """Samples of two contacts that don't move, from which on they are solved without a table."""
 _TABLE_DEGREE = 12
-_NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
+RADIUS_TABLE_NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_TABLE_DEGREE)
+"""Fractions of a side at which conformal radii are solved, for `log_radius_table`."""
 _TO_TABLE = np.linalg.solve(  # interpolates values at the nodes to the tables' nodes
-    np.polynomial.legendre.legvander((2 * _NODES - 1) / (1 - 2 * EDGE_INSET_FRACTION), _TABLE_DEGREE).T,
+    np.polynomial.legendre.legvander(
+        (2 * RADIUS_TABLE_NODES - 1) / (1 - 2 * EDGE_INSET_FRACTION), _TABLE_DEGREE
+    ).T,
     np.polynomial.legendre.legvander((2 * TABLE_NODES - 1) / (1 - 2 * EDGE_INSET_FRACTION), _TABLE_DEGREE).T,
 ).T
 
@@ -55,20 +58,28 @@ def solve_outline(
     sheet = _OutlineSheet(shape, gaps, unevenness, _DEGREE if covers_sides else _RADIUS_DEGREE)
     shares = sheet.interpolate(TABLE_NODES, TABLE_NODES, sheet.unit_potentials)
     even = _OutlineSheet(shape, gaps, Unevenness(), _RADIUS_DEGREE if covers_sides else _ARC_RADIUS_DEGREE)
-    coarse = np.stack(np.meshgrid(_NODES, _NODES, indexing="ij")).reshape(2, -1)
-    regular = (even.evaluate(_NODES, _NODES) * even.regular_parts(coarse).T).sum(axis=1)
+    coarse = np.stack(np.meshgrid(RADIUS_TABLE_NODES, RADIUS_TABLE_NODES, indexing="ij")).reshape(2, -1)
+    regular = (even.evaluate(RADIUS_TABLE_NODES, RADIUS_TABLE_NODES) * even.regular_parts(coarse).T).sum(
+        axis=1
+    )
     log_radius = 2 * math.pi * regular + np.log(shape.stretch_at(coarse))
     log_radius -= math.log(
         (1 + shape.stretch) / 2
     )  # a disc is stretched to an ellipse, of that mean half axis
-    table = log_radius.reshape(2 * (len(_NODES),))
-    if covers_sides:  # the radius vanishes at all sides; without that a polynomial is left
-        table = _TO_TABLE @ (table - _log_edge_distance(_NODES)) @ _TO_TABLE.T + _log_edge_distance(
-            TABLE_NODES
-        )
-    else:
-        table = _TO_TABLE @ table @ _TO_TABLE.T
+    table = log_radius_table(log_radius, covers_sides)
     return SheetMaps(sheet.conductance, np.concatenate([shares, table[None]]))
+
+
+def log_radius_table(log_radius: FloatArray, covers_sides: bool) -> FloatArray:
+    """Return logarithms of conformal radii at `TABLE_NODES` from those (n n,) at `RADIUS_TABLE_NODES`.
+
+    covers_sides: electrodes cover all sides, where the radius vanishes; without that a polynomial is left.
+    """
+    table = log_radius.reshape(2 * (len(RADIUS_TABLE_NODES),))
+    if not covers_sides:
+        return np.asarray(_TO_TABLE @ table @ _TO_TABLE.T)
+    table = _TO_TABLE @ (table - _log_edge_distance(RADIUS_TABLE_NODES)) @ _TO_TABLE.T
+    return np.asarray(table + _log_edge_distance(TABLE_NODES))
 
 
 def _log_edge_distance(nodes: FloatArray) -> FloatArray:

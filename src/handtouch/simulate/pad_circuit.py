@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.simulate.contact_patch import discs
 from handtouch.simulate.faults import Fault, FaultContacts
+from handtouch.simulate.mesh_geometry import SimulatedMesh
+from handtouch.simulate.mesh_solver import mesh_mutual_resistance
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.outline_solver import outline_mutual_resistance
 from handtouch.simulate.pad_geometry import SimulatedSurface
@@ -233,6 +235,8 @@ class PadCircuit:
         """Return mutual resistances (n, k, k) of contacts on 1 ohm per square; 0 on the diagonal."""
         if isinstance(self.shape, SimulatedOutline):
             green = outline_mutual_resistance(self.shape, self.gaps)
+        elif isinstance(self.shape, SimulatedMesh):
+            green = mesh_mutual_resistance(self.shape, self.gaps)
         else:
             assert isinstance(self.gaps, ElectrodeGaps)
             green = mutual_resistance(self.shape, self.gaps)

@@ -132,6 +132,11 @@ class SimulatedSurface(SheetMetric):
         """Return the lengths along the surface from electrodes x0 and y0."""
         return s_m, phi * float(self.radius(s_m))
 
+    def film_fractions(self, place_m: FloatArray) -> FloatArray:
+        """Return the fractions (n, 2) of places (n, 2) on the pad's film, as `arc_lengths` counts them."""
+        around = self.arc * self.radius(place_m[:, 0])
+        return np.stack([place_m[:, 0] / self.length_m, place_m[:, 1] / around], axis=1)
+
     def metres_per_fraction(self, x: float, y: float) -> FloatArray:  # noqa: ARG002
         """Return the derivatives (2, 2) of positions along the surface by the fractions of the pad."""
         return np.diag([self.length_m, self.arc * float(self.radius(x * self.length_m))])

@@ -14,6 +14,7 @@ from typing import Any
 
 from handtouch import config
 from handtouch.host.plugins import load_plugins
+from handtouch.simulate.mesh_geometry import SimulatedMesh
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.pad_geometry import (
     SimulatedPrism,
@@ -83,6 +84,7 @@ _BUILDERS: Mapping[str, Callable[[Any], SimulatedSurface]] = MappingProxyType(
         "sphere": _sphere,
         "prism": _prism,
         "revolution": _revolution,
+        "mesh": SimulatedMesh.from_table,
     }
 )
 """By `kind` of the deployment's `surface` table."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.coarse_sheet import CoarseGrid, CoarseSolution
+from handtouch.simulate.mesh_geometry import SimulatedMesh
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
@@ -39,7 +40,7 @@ def cut_sheet_maps(
 
     Raises ValueError for a pad of any outline, whose cuts aren't simulated.
     """
-    if isinstance(shape, SimulatedOutline):
+    if isinstance(shape, SimulatedOutline | SimulatedMesh):
         raise ValueError("a torn sheet is simulated on rectangles only; give the fault to another pad")
     after, before = _solve_coarse(shape, gaps, cut), _solve_coarse(shape, gaps, None)
     table = maps.table.copy()

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.simulate.coarse_sheet import CoarseGrid
+from handtouch.simulate.mesh_geometry import SimulatedMesh
+from handtouch.simulate.mesh_solver import solve_mesh
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.outline_solver import solve_outline
 from handtouch.simulate.pad_geometry import SimulatedSurface
@@ -49,6 +51,8 @@ def uneven_sheet_maps(
     """Return the maps of an uneven sheet of nominally 1 ohm per square; cached."""
     if isinstance(shape, SimulatedOutline):
         return solve_outline(shape, gaps, unevenness)
+    if isinstance(shape, SimulatedMesh):
+        return solve_mesh(shape, gaps, unevenness)
     assert isinstance(gaps, ElectrodeGaps)
     maps = solve_sheet(shape, gaps)
     if unevenness.is_even:

@@ -38,7 +38,7 @@ from handtouch.simulate.solved_contact import (
 )
 from handtouch.simulate.stimulus import AppliedContact, Stimulus
 from handtouch.simulate.truth import GroundTruth, Vector
-from handtouch.simulate.unevenness import ohm_ratio
+from handtouch.simulate.unevenness import wave_ratio
 from handtouch.simulate.virtual_pad import VirtualPad
 from handtouch.simulate.worlds import DrawnWorld
 
@@ -348,6 +348,7 @@ class _HealthyCircuits:
         self._modes = max((one.modes for one in uneven), key=len)
         self._amplitudes = _padded([np.array(one.amplitudes) for one in uneven]).T
         """(modes, rows)"""
+        self._films = [one.film for one in uneven]
         self._is_even = all(one.is_even for one in uneven)
 
     def solve_contacts(
@@ -370,7 +371,11 @@ class _HealthyCircuits:
         """Return the local over the nominal sheet resistance (k,) at positions (2, k)."""
         if self._is_even:
             return np.ones(len(rows))
-        return ohm_ratio(self._modes, self._amplitudes[:, rows], position)
+        ratio = wave_ratio(self._modes, self._amplitudes[:, rows], position)
+        for k, row in enumerate(rows.tolist()):
+            if film := self._films[row]:
+                ratio[k] *= np.exp(film.log_at(position[:, k]))
+        return ratio
 
 
 def _vector(values: FloatArray) -> Vector:

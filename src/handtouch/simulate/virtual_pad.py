@@ -21,12 +21,14 @@ from handtouch.simulate import noise
 from handtouch.simulate.channel_errors import ChannelErrors
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault, Gum, StuckChannel
+from handtouch.simulate.film import FilmRatio
 from handtouch.simulate.pad_circuit import PadCircuit
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
+from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_shear import VirtualShear
@@ -89,7 +91,9 @@ class VirtualPad:
         shape = world.surface(hand, pad)
         gaps = true_arcs(pad, hidden) if pad.arcs_mm else true_gaps(shape, hidden)
         _check_faults(pad, faults, stimulus)
-        unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness)
+        nominal = simulated_surface(pad.surface)
+        film = FilmRatio.of_pad(pad, deployment.sheets[pad.sheet], nominal)
+        unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness, film)
         circuit = PadCircuit(
             shape,
             gaps,
