@@ -9,15 +9,20 @@ from how they differ.
 
 *Two contacts at once*: 0.3 to 3 N each, at uniform positions from 5 % of a side inside the edges; sheets
 without creep and hysteresis, for which forces of two contacts aren't compensated; reported at a false-alarm
-rate of 0.1 %.
+rate of 0.1 %. *Unequal*: those whose forces differ by a factor of 3 and more.
+
+*Many electrodes*, a part of its own (`ARGS="--part many"`): plane pads of 24 x 18 mm with 5, 8, 12 and 16
+equal electrodes along their whole edge, gaps of 0.4 mm; world `default`, as configured and with the gains
+learned from 48 more touches.
 """
 
 from __future__ import annotations
 
 import os
+from argparse import Namespace
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -25,7 +30,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bench_worlds import UNITS, WARM_UP, drawn_world, with_stated_touches
+from benchmarks.bench_worlds import (
+    DRAWN_MORE,
+    DRAWN_PER_LEARNT,
+    UNITS,
+    WARM_UP,
+    drawn_world,
+    learn,
+    with_stated_touches,
+)
 from benchmarks.hand_touches import (
     REST_S,
     SAMPLE_S,
@@ -39,22 +52,40 @@ from benchmarks.hand_touches import (
     serve,
     tangent_basis,
 )
-from benchmarks.page import Report, options
+from benchmarks.page import Report, options, progress
 from benchmarks.scores import ClusterShare, Estimates, EstimateScore, Share, bin_labels, concatenate, slices
 from handtouch import wire
-from handtouch.config import Deployment, load, shipped
+from handtouch.config import Deployment, load, parse, shipped
 from handtouch.core.pad_model import PadModel
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import DrawnWorld
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, MountSpread
 
 ERRORS = {"position": position_error, "force": force_error}
-WORLDS = ("default", "harsh")
+REPORTED = ("default", "harsh")
 PAIRED = "middle"
 PAIR_FORCES_N = (0.3, 3.0)
 DISTANCES_MM = (8.0, 12.0, 16.0)
+UNEQUAL = 3.0
+MANY, LEARNT, RECTANGLE_MM = (5, 8, 12, 16), 48, (24.0, 18.0)
+_RECTANGLE_HEAD = """
+[daemon]
+sync_period_ms = 10.0
+[[bus]]
+name = "can0"
+interface = "udp_multicast"
+channel = "239.74.163.2"
+[sheet.soft]
+ohm_per_square = 2400.0
+contact_ohm_mm2 = 12_000.0
+alpha = 1.5
+contact_radius_mm = 1.5
+contact_radius_std_mm = 0.15
+[[hand]]
+name = "finger"
+"""
 
 
 @dataclass(frozen=True)
@@ -67,18 +98,68 @@ class Played:
 
 @dataclass(frozen=True)
 class PlayedPair:
-    """Two touches at once: distance, whether two were reported, and of each, squared deviations of position
-    and force from the truth, errors [m, N], NaN without a force, and standard deviation of the position [m].
+    """Two touches at once: distance, whether two were reported, larger over smaller true force.
+
+    And of each, squared deviations of position and force from the truth, errors [m, N], NaN without a force,
+    and standard deviation of the position [m].
     """
 
     finger: int
     distance_mm: float
     reported: bool
+    force_ratio: float
     position: tuple[float, ...] = ()
     force: tuple[float, ...] = ()
     error_m: tuple[float, ...] = ()
     error_n: tuple[float, ...] = ()
     std_m: tuple[float, ...] = ()
+
+
+def rectangle_deployment(counts: Sequence[int]) -> Deployment:
+    """Return plane pads of so many equal electrodes along their whole edge."""
+    length, width = RECTANGLE_MM
+    text = [_RECTANGLE_HEAD]
+    for number, count in enumerate(counts, 1):
+        ends = np.linspace(0.0, 2 * (length + width), count + 1)
+        arcs = ", ".join(f"e{k} = [{ends[k]:.4f}, {ends[k + 1]:.4f}]" for k in range(count))
+        channels = ", ".join(f'"0x6401:{k + 1}"' for k in range(count))
+        text.append(
+            f"[node.n{count}]\nchannels = [{channels}]\ndrive_v = 5.0\nfull_scale_ma = 10.0\n"
+            f'noise_counts = 1.0\n[[hand.pad]]\nlink = "pad{count}"\nbus = "can0"\n'
+            f'node_id = {number}\nserial = {number}\nnode = "n{count}"\nsheet = "soft"\n'
+            f"gap_mm = 0.4\nelectrode_arcs_mm = {{ {arcs} }}\nseries_ohm = {[20.0] * count}\n"
+            f'[hand.pad.surface]\nkind = "outline"\noutline_x_mm = [0.0, {length}, {length}, 0.0]\n'
+            f"outline_y_mm = [0.0, 0.0, {width}, {width}]\nedge_turn_deg = [0.0, 0.0, 0.0, 0.0]\n"
+            f"corners_mm = [0.0, {length}, {length + width}, {2 * length + width}]\n"
+        )
+    return parse("".join(text))
+
+
+def play_many(
+    number: int, touches: int, counts: Sequence[int], family: Family = Family.REPORTING
+) -> Estimates:
+    """Return estimates of the position on rectangles with many electrodes, in each state."""
+    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(family.seed(number))
+    deployment = drawn.describe(rectangle_deployment(counts))
+    model, numbers = PadModel(deployment), range(WARM_UP, WARM_UP + touches)
+    others = range(numbers.stop, numbers.stop + round(DRAWN_PER_LEARNT * LEARNT) + DRAWN_MORE)
+    stimulus = Scenario(touch=draw_touches(model.links, others.stop, drawn.seed))
+    hand = VirtualHand(deployment, stimulus, drawn)
+    readings, parts = TouchReadings.of_hand(hand, deployment, numbers), list[Estimates]()
+    for state in ("as configured", f"after {LEARNT} contacts"):
+        if parts:
+            for row in range(model.size):
+                if calibration := learn(hand, deployment, model, row, others, (LEARNT,))[0].calibration:
+                    model.set_calibration(row, calibration)
+        contacts = readings.contacts(model, deployment)
+        for row, link in enumerate(model.links):
+            found = [(contacts.get(key), truth) for key, truth in readings.truths.items() if key[1] == link]
+            case = f"{model.electrode_counts[row]:2d} electrodes, {state}"
+            columns = {"case": np.full(len(found), case), "finger": np.full(len(found), number)}
+            unknown = np.full((len(found), 2, 2), np.nan)
+            errors = [position_error(*pair) for pair in found]
+            parts.append(estimates(errors, np.array([t.bound_m for _, t in found]), unknown, columns))
+    return concatenate(parts)
 
 
 def play(world: str, number: int, touches: int) -> Played:
@@ -157,8 +238,9 @@ def compare_pair(finger: int, contact: wire.Contact | None, truths: list[GroundT
     """Compare two reported contacts with the true ones that they are nearer to."""
     true_m = np.array([truth.position_m for truth in truths])
     distance_mm = 1e3 * float(np.linalg.norm(true_m[1] - true_m[0]))
+    small, large = sorted(truth.force_n for truth in truths)
     if contact is None or not contact.parts:
-        return PlayedPair(finger, distance_mm, False)
+        return PlayedPair(finger, distance_mm, False, large / small)
     at = np.array([part["position_m"] for part in contact.parts])
     kept, crossed = (np.linalg.norm(at - true_m[order], axis=1).sum() for order in ([0, 1], [1, 0]))
     rows = []
@@ -173,7 +255,7 @@ def compare_pair(finger: int, contact: wire.Contact | None, truths: list[GroundT
         rows.append(
             (*squares, float(np.linalg.norm(error)), float(force), float(np.sqrt(covariance.trace())))
         )
-    return PlayedPair(finger, distance_mm, True, *zip(*rows, strict=True))
+    return PlayedPair(finger, distance_mm, True, large / small, *zip(*rows, strict=True))
 
 
 def pair_rows(pairs: list[PlayedPair], distances_mm: Sequence[float] = DISTANCES_MM) -> list[dict[str, Any]]:
@@ -224,19 +306,47 @@ def share_of(hits: NDArray[np.bool_], finger: NDArray[Any]) -> ClusterShare | No
     return ClusterShare.of_mask(hits, finger) if len(np.unique(finger)) > 1 else None
 
 
+def measure_many(asked: Namespace) -> None:
+    """Measure pads with many electrodes."""
+    fingers, touches, counts = (1, 4, MANY[:2]) if asked.quick else (asked.many, asked.touches, MANY)
+    report = Report(asked.quick, "many", fingers=fingers, touches_of_a_pad=touches)
+    made = []
+    for number in range(fingers):
+        made.append(play_many(number, touches, counts))
+        progress(f"many electrodes: finger {number + 1} of {fingers}")
+    rows = []
+    for case, own in slices(concatenate(made), "case"):
+        valid = own.where(own.valid)
+        row = EstimateScore.of_estimates(own).row(UNITS["position"][1], bounds=False)
+        row["in 95 %, of fingers"] = share_of(valid.stated_levels() <= 0.95, valid.columns["finger"])
+        rows.append({"case": case.strip(), **row})
+    report.table("Position by number of electrodes in `default`", rows)
+    report.keep()
+
+
 def main() -> None:
     parser = options(__doc__)
+    parser.add_argument("--part", choices=["", "many"], help="by default both")
+    parser.add_argument("--many", type=int, default=6, help="fingers with many electrodes")
     parser.add_argument("--hands", type=int, default=40)
     parser.add_argument("--touches", type=int, default=16, help="of each pad")
     parser.add_argument("--paired", type=int, default=40, help="fingers with pairs of touches")
     parser.add_argument("--pairs", type=int, default=8, help="of each paired finger")
     asked = parser.parse_args()
+    if asked.part != "":
+        measure_many(asked)
+    if asked.part != "many":
+        measure_fingers(asked)
+
+
+def measure_fingers(asked: Namespace) -> None:
+    """Measure the pads with three and six electrodes."""
     if asked.quick:
         asked.hands, asked.touches, asked.paired, asked.pairs = 2, 3, 2, 6
     report = Report(
         asked.quick, hands=asked.hands, touches_of_a_pad=asked.touches, pairs_of_fingers=asked.paired
     )
-    for world in WORLDS:
+    for world in REPORTED:
         made, pairs = [], []
         with ProcessPoolExecutor(min(asked.hands, os.cpu_count() or 1)) as pool:
             tasks = [
@@ -255,6 +365,8 @@ def main() -> None:
             report.table(f"{quantity.capitalize()} in `{world}`", rows_of(every, quantity))
         false = np.array([one for finger in made for one in finger.false_pairs])
         report.table(f"Two contacts at once in `{world}`", pair_rows(pairs))
+        unequal = [pair for pair in pairs if pair.force_ratio >= UNEQUAL]
+        report.table(f"Unequal ones in `{world}`", pair_rows(unequal))
         report.table(f"Single contacts reported as two in `{world}`", [{"share, %": Share.of_mask(false)}])
     report.keep()
 

@@ -14,8 +14,10 @@ before its onset. *An hour of chatter*: other hands of `default` at 200 Hz with 
 such grips, without bursts, slip at 10 mm/s and faster. *Percepts*: times that a published percept became
 `incipient` or `sliding`, without joint states; `incipient` has a lower threshold than the alarm.
 
-*More noise than is stated*: light grips at rest, 3.5 % ripple and 12 um of sway, with white noise added, and
-slips of 10 mm/s at 0.3, 1 and 3 N; the daemon has measured the noise on untouched pads before.
+*More noise than is stated*: light grips at rest, 3.5 % ripple and 12 um of sway, with white noise added or
+with hum of 50 Hz, and slips of 10 mm/s at 0.3, 1 and 3 N; the daemon has measured the noise on untouched pads
+before. *Named*: pads with the diagnosis `noise` when they are touched. This and the next table are a part of
+their own, `ARGS="--part noise"`.
 
 *Light contacts whose force varies*: 0.15, 0.3 and 0.6 N, every two seconds to 15 % and back within a ramp;
 noise as stated.
@@ -33,7 +35,7 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +49,12 @@ from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
+from handtouch.daemon.noise_report import NoiseReport
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, Fixed
 from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = npt.NDArray[np.float64]
@@ -95,6 +98,8 @@ class Record:
     """
     samples_per_false_alarm: float
     """Mean samples between false alarms, the threshold on R of an alarm."""
+    named_noisy: Share
+    """Pads with the diagnosis `noise`, at `named_s`."""
     load: float = 1.0
     """Force during the slip, relative to that before."""
 
@@ -124,10 +129,12 @@ def run(
     from_s: float = 0.0,
     information_s: float = 0.0,
     noise_ratio: float = 1.0,
+    named_s: float = 0.0,
 ) -> Record:
     """Process grips, each one contact on its link's pad, from `from_s` of the scenario on.
 
-    `noise_ratio`: true noise of the channels over what the deployment states.
+    `noise_ratio`: true noise of the channels over what the deployment states. `named_s`: time at which
+    diagnoses of noise are counted.
     """
     deployment, period_ns = world.describe(DEPLOYMENT), round(1e9 / hz)
     hand = VirtualHand(deployment, Scenario.model_validate({"touch": grips}), world)
@@ -152,6 +159,7 @@ def run(
     shape = len(times), model.size
     log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
     durations_s = np.empty((3, len(times)))
+    named, report = Share(0, model.size), NoiseReport(model.size)
     payload, information = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
     for k, t_s in enumerate(times.tolist()):
         t_ns = 10**9 + round(t_s * 1e9)
@@ -170,6 +178,8 @@ def run(
         if k == round(information_s * hz):
             per_axis = [slip.column(f"information_{axis}") for axis in "xy"]
             information = slip.column("onset_ages_s").copy(), np.mean(per_axis, axis=0)
+        if k == round(named_s * hz):
+            named = Share(sum(report.find(pipeline.tick)), model.size)
         force[k] = pipeline.tick.columns.force_n
     return Record(
         times - from_s,
@@ -182,6 +192,7 @@ def run(
         collector.percepts,
         information,
         slip.samples_per_false_alarm,
+        named,
     )
 
 
@@ -197,7 +208,9 @@ LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
 SMOOTH_S = (0.0, 0.01, 0.03)
 BURST_MM = 0.1
-NOISE_RATIOS, LIGHT_FORCES, SLIP_FORCES = (1.0, 1.5, 2.0, 3.0), (0.3, 0.6, 1.0), (0.3, 1.0, 3.0)
+NOISES = (1.0, 0.0), (1.5, 0.0), (2.0, 0.0), (3.0, 0.0), (1.0, 3.0), (1.0, 10.0)
+"""True noise over stated, and amplitude of hum in counts."""
+LIGHT_FORCES, SLIP_FORCES = (0.3, 0.6, 1.0), (0.3, 1.0, 3.0)
 RAMPS_S, RAMPED_FORCES = (0.05, 0.4), (0.15, 0.3, 0.6)
 UNTOUCHED_S = 90.0
 """Time in which the noise is learned, before it matters"""
@@ -333,19 +346,23 @@ def false_alarms(firm: Record) -> tuple[Rate, int]:
     return Rate(int(rising[lasting].sum()), hours), int(rising[~lasting].sum())
 
 
-def noisy(ratio: float, quick: bool) -> dict[str, Any]:
+def noisy(ratio: float, hum_counts: float, quick: bool, family: Family = Family.REPORTING) -> dict[str, Any]:
     """Return false alarms of light grips, and slips of 10 mm/s found, with more noise than the file states.
 
     The daemon sees the untouched pads for `UNTOUCHED_S` before.
     """
-    world, still, found, slips = WORLDS["default"].draw(Family.REPORTING.seed(41)), dict[str, int](), 0, 0
+    plain = WORLDS["default"]
+    hums = replace(plain.electronics, hum_counts=Fixed(hum_counts)) if hum_counts else plain.electronics
+    world = replace(plain, electronics=hums).draw(family.seed(41))
+    still, found, slips = dict[str, int](), 0, 0
     seconds, rounds = (6.0, 1) if quick else (245.0, 4)
     minutes, hz = len(PADS) * (seconds - 1.0) / 60, 200.0
     grips = [
         grip(k, UNTOUCHED_S, seconds, LIGHT_FORCES[k % 3], 700, ripple=0.035, sway_mm=0.012)
         for k in range(len(PADS))
     ]
-    held = run(grips, world, hz, UNTOUCHED_S + GRIPPED_S + seconds, noise_ratio=ratio)
+    until_s = UNTOUCHED_S + GRIPPED_S + seconds
+    held = run(grips, world, hz, until_s, noise_ratio=ratio, named_s=UNTOUCHED_S)
     begin_s = UNTOUCHED_S + GRIPPED_S + 1.0
     for alarms in (ALARMS, ("sliding",)):
         still[alarms[-1] if len(alarms) == 1 else "any"] = percept_alarms(held, begin_s, alarms)
@@ -365,6 +382,8 @@ def noisy(ratio: float, quick: bool) -> dict[str, Any]:
             delays += after[:1].tolist()
     return {
         "true noise over stated": ratio,
+        "hum, counts": hum_counts,
+        "named, %": held.named_noisy,
         "contact minutes": minutes,
         "false alarms a minute": Rate(still["any"], minutes),
         "of them `sliding`": Rate(still["sliding"], minutes),
@@ -502,11 +521,18 @@ def measure(report: Report) -> None:
         progress(worlds[-1])
     report.table("By world", worlds)
     report.table("An hour of chatter", [held_row])
-    report.table("More noise than is stated", [noisy(ratio, quick) for ratio in NOISE_RATIOS])
-    report.table("Light contacts whose force varies", [ramped(ramp_s, quick) for ramp_s in RAMPS_S])
     report.table("From onset to alarm", late)
     report.table("Against a threshold on the derivative of force", against)
     report.table("Cost", costs)
+
+
+def measure_noise(report: Report) -> None:
+    rows = []
+    for ratio, hum in NOISES:
+        rows.append(noisy(ratio, hum, report.quick))
+        progress(rows[-1])
+    report.table("More noise than is stated", rows)
+    report.table("Light contacts whose force varies", [ramped(ramp_s, report.quick) for ramp_s in RAMPS_S])
 
 
 def chatter(quick: bool) -> dict[str, Any]:
@@ -533,10 +559,19 @@ def chatter(quick: bool) -> dict[str, Any]:
     }
 
 
+PARTS = {"": measure, "noise": measure_noise}
+"""What is measured in separate runs, by the part of the page."""
+
+
 def main() -> None:
-    report = Report(options(__doc__).parse_args().quick)
-    measure(report)
-    report.keep()
+    parser = options(__doc__)
+    parser.add_argument("--part", choices=list(PARTS), help="by default both")
+    asked = parser.parse_args()
+    for part, fill in PARTS.items():
+        if asked.part in (None, part):
+            report = Report(asked.quick, part)
+            fill(report)
+            report.keep()
 
 
 if __name__ == "__main__":

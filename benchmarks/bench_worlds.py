@@ -47,7 +47,7 @@ from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
-from handtouch.hand import electrode_network, models_with_other_parts, part_limits, part_stds
+from handtouch.hand import models_with_other_parts, pad_network, part_limits, part_stds
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -130,12 +130,12 @@ def learn(
     held_s = begin_s + SAMPLE_S - period_s * np.arange(HELD_SAMPLES)
     rest_s = begin_s - period_s * np.arange(1, REST_SAMPLES + 1)
     held, rest = (
-        hand.counts(row, times.ravel()).reshape(*times.shape, 4).mean(axis=1) for times in (held_s, rest_s)
+        hand.counts(row, times.ravel()).reshape(*times.shape, -1).mean(axis=1) for times in (held_s, rest_s)
     )
     padded = np.concatenate([rest[:1].repeat(REST_PAUSES - 1, axis=0), rest])
     rest = np.lib.stride_tricks.sliding_window_view(padded, REST_PAUSES, axis=0).mean(axis=-1)
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-    network = electrode_network(pad, sheet)
+    network = pad_network(pad, sheet)
     others = models_with_other_parts(network, pad, node, sheet)
     calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet), part_limits(pad, node))
     calibrator.assign_node(row + 1, None, None, "", 0)
