@@ -53,6 +53,23 @@ def test_outlines_agree_with_field(kind: str) -> None:
         np.testing.assert_allclose(shape.normal(s, phi), surface.normal(*rectangle), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("at", [(0.02, 0.02), (0.98, 0.5), (0.5, 0.5)])
+def test_places_beside_one_on_an_outline_are_as_far_or_beyond_its_edge(at: tuple[float, float]) -> None:
+    outline = OUTLINE_TABLES["outline"].model_copy(
+        update={
+            "outline_x_mm": (0.0, 24.0, 24.0, 0.0),
+            "outline_y_mm": (0.0, 0.0, 18.0, 18.0),
+            "edge_turn_deg": (0.0,) * 4,
+            "corners_mm": (0.0, 24.0, 42.0, 66.0),
+        }
+    )
+    shape, angle = simulated_surface(outline), np.linspace(0.0, 2 * np.pi, 16)
+    vector_m = 2e-3 * np.stack([np.cos(angle), np.sin(angle)])
+    found = shape.fractions_beside(np.array([[at[0]], [at[1]]]), vector_m[None])[0]
+    expected = np.array([[at[0]], [at[1]]]) + vector_m / [[24e-3], [18e-3]]
+    np.testing.assert_allclose(np.clip(found, 0, 1), np.clip(expected, 0, 1), atol=1e-6)
+
+
 @pytest.mark.parametrize("kind", OUTLINE_TABLES)
 def test_resized_outlines_are_longer_and_wider_about_their_middle(kind: str) -> None:
     shape = simulated_surface(OUTLINE_TABLES[kind])

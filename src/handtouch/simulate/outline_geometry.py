@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handtouch.simulate.pad_geometry import SimulatedSurface, SurfaceProjection
 
 FloatArray = NDArray[np.float64]
+_EDGE = 1e-9  # fraction of the pad: corners have no direction
 _NEWTON_STEPS = 25
 _HULL_POINTS = 96
 _PLATE_THICKNESS_M = 4e-3
@@ -221,6 +222,7 @@ class SimulatedOutline(SimulatedSurface):
         """Return fractions of the pad (k, 2, n) at vectors (k, 2, n) [m] from positions (2, k).
 
         They are those of the drawing, which is a conformal image of the surface, in metres on the latter.
+        Each step begins on the pad: beyond it the drawing may have no slopes.
         """
         count = vector_m.shape[2]
         start = np.repeat(position, count, axis=1)
@@ -228,6 +230,7 @@ class SimulatedOutline(SimulatedSurface):
         target = self.drawing(start)[0] + vector / self.stretch_at(start)
         found = start + self.fractions_of(start, vector)
         for _ in range(2):
+            found = np.clip(found, _EDGE, 1 - _EDGE)
             miss = target - self.drawing(found)[0]
             found = found + self.fractions_of(found, miss * self.stretch_at(found))
         return np.asarray(found.reshape(2, -1, count).transpose(1, 0, 2))
