@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,23 +30,17 @@ from benchmarks.served_hand import daemon_process, in_own_network, on_loopback
 from handtouch.client.hand import Hand
 from handtouch.config import load
 from handtouch.simulate import TactileNodes
-from handtouch.simulate.tactile.grip_environment import (
-    EPISODE_STEPS,
-    PERIOD_S,
-    TOUCH,
-    GripEnvironments,
-    GripScene,
-)
+from handtouch.simulate.tactile.grip_environment import GripEnvironments, GripScene
 from handtouch.simulate.worlds import Family
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 from learn_grip import CANDIDATES, TRAINED, WEIGHT_M_S2, GripPolicy, Outcome, learn, other_objects, run
+from run_grip import episode, wait_until_clear
 
 FloatArray = NDArray[np.float64]
 WORLD, PORT = "default", 43998
 LEARNED_WITH = 1  # seed of a sensor, of the family for tuning
 GENERATIONS, SENSORS, OBJECTS = 6, 4, 20
-CLEAR_TIMEOUT_S = 30.0
 
 
 def in_task(weights: FloatArray, objects: tuple[FloatArray, FloatArray], seed: int) -> Outcome:
@@ -81,35 +74,6 @@ def on_daemon(weights: FloatArray, objects: tuple[FloatArray, FloatArray], seed:
             outcomes.append(episode(scene, nodes, hand, GripPolicy(weights[None])))
     cost, force_n, dropped = map(np.array, zip(*outcomes, strict=True))
     return Outcome(cost, force_n, dropped)
-
-
-def episode(
-    scene: GripScene, nodes: TactileNodes, hand: Hand, policy: GripPolicy
-) -> tuple[float, float, bool]:
-    """Run an episode in real time; return its cost, final force and whether the object was dropped."""
-    cost, due_s = 0.0, time.monotonic()
-    for _ in range(EPISODE_STEPS):
-        hand.latest()
-        action = policy.act(TOUCH.of(hand)[None], np.array([scene.force_n]))
-        cost -= scene.step(float(action[0, 0]))
-        nodes.update(scene.data)
-        due_s += PERIOD_S
-        time.sleep(max(0.0, due_s - time.monotonic()))
-    return cost, scene.force_n, scene.dropped
-
-
-def wait_until_clear(hand: Hand) -> None:
-    """Wait until both pads are sampled and untouched. Raises TimeoutError."""
-    end_s = time.monotonic() + CLEAR_TIMEOUT_S
-    sampled, touched = (
-        [TOUCH.names.index(f"{link}.{name}") for link in TOUCH.links] for name in ("sampled", "touched")
-    )
-    while time.monotonic() < end_s:
-        if hand.wait(1.0):
-            touch = TOUCH.of(hand)
-            if touch[sampled].all() and not touch[touched].any():
-                return
-    raise TimeoutError(f"pads aren't clear after {CLEAR_TIMEOUT_S:g} s")
 
 
 def row(policy: str, where: str, outcomes: list[Outcome], needed_n: FloatArray) -> dict[str, Any]:

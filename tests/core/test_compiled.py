@@ -40,7 +40,15 @@ def copied(tmp_path: Path) -> Path:
     return tmp_path / "src"
 
 
-COUNTS = {"solve": 400, "detect": 400, "frames": 600, "shear": 400, "pairs": 100, "evidence": 600}
+COUNTS = {
+    "solve": 400,
+    "detect": 400,
+    "frames": 600,
+    "shear": 400,
+    "pairs": 100,
+    "evidence": 600,
+    "simulator": 60,
+}
 """Contacts, ticks or samples by program; a pair of contacts takes two seconds of the interpreter."""
 
 
