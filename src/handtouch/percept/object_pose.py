@@ -42,7 +42,7 @@ _STEP_M, _STEP_RAD = 2e-4, 5e-3
 _MAX_STEP_M, _MAX_STEP_RAD = 10e-3, 0.5
 _FIRST_STARTS, _FIRST_ITERATIONS = 48, 5
 _KEPT_STARTS, _TURNED_STARTS, _NEW_STARTS, _ITERATIONS = 12, 4, 6, 3
-_SAMPLES = 256
+_SAMPLES = 192
 MAX_OUTLIERS = 0.5
 """Share of outliers beyond which a pose explains nothing."""
 _ALIGNMENTS = 256
@@ -54,6 +54,7 @@ _PINNED = 1e8  # information about a rotation that changes nothing
 _MAX_LOG_GAP = 15.0
 _MIN_WEIGHT = 0.02
 _MIN_SHARE = 1e-3
+_OPPOSITE = 1e-6  # sine of the angle between axes that count as opposite
 _MIN_SCATTER = 10
 
 
@@ -376,6 +377,10 @@ class PoseSampler:
         cross = flipped[..., None] * np.cross(of_others[None], axes[:, None])
         sine = np.linalg.norm(cross, axis=2)
         angle = np.arctan2(sine, flipped * cosine)
+        opposite = (sine < _OPPOSITE) & (angle > 1.0)  # turned by pi about any axis across
+        across = np.linalg.svd(of_others[:, None])[2][:, 1]
+        cross[opposite] = np.broadcast_to(across, cross.shape)[opposite]
+        sine[opposite] = 1.0
         return np.asarray(cross * (angle / np.maximum(sine, 1e-12))[..., None])
 
     def _rotation_differences(self, poses: Poses, others: Poses) -> FloatArray:

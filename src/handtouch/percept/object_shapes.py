@@ -117,22 +117,22 @@ class _Turned(KnownShape):
         super().__init__(np.array([radius, radius, (high - low) / 2]), 1, flips)
 
     def distance(self, points: FloatArray) -> FloatArray:
-        around, along = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
+        around, along = _length(points[..., 0], points[..., 1]), points[..., 2]
         found = np.full(around.shape, np.inf)
         for radius, middle, half in self._parts.tolist():
             a, b = around - radius, np.abs(along - middle) - half
-            distance = np.hypot(np.maximum(a, 0), np.maximum(b, 0)) + np.minimum(np.maximum(a, b), 0)
+            distance = _length(np.maximum(a, 0), np.maximum(b, 0)) + np.minimum(np.maximum(a, b), 0)
             np.minimum(found, distance, out=found)
         return found
 
     def distance_and_normal(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        around, along = np.hypot(points[..., 0], points[..., 1]), points[..., 2]
+        around, along = _length(points[..., 0], points[..., 1]), points[..., 2]
         found, outward, upward = np.full(around.shape, np.inf), np.zeros(around.shape), np.zeros(around.shape)
         for radius, middle, half in self._parts.tolist():
             off = along - middle
             a, b = around - radius, np.abs(off) - half
             over_a, over_b = np.maximum(a, 0), np.maximum(b, 0)
-            beyond = np.hypot(over_a, over_b)
+            beyond = _length(over_a, over_b)
             distance = beyond + np.minimum(np.maximum(a, b), 0)
             nearer = distance < found
             is_inside = beyond == 0
@@ -197,6 +197,11 @@ def build_shape(known: ObjectTable) -> KnownShape:
         return _Turned(_M_PER_MM / 2 * np.array([head, shank]))
     assert isinstance(shape, MeshShape)
     return _grid_of_mesh(Path(shape.file), shape.unit_mm * _M_PER_MM)
+
+
+def _length(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return np.hypot for ordinary numbers, which takes a third of its time."""
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def _from_excess(excess: FloatArray) -> tuple[FloatArray, FloatArray]:
