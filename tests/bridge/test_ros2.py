@@ -91,7 +91,10 @@ LOCATED = replace(
 
 @pytest.mark.parametrize(
     "kind",
-    [ros.WrenchStamped, ros.RosJointState, ros.MarkerArray, ros.DiagnosticArray, ContactArray],
+    [
+        *(ros.WrenchStamped, ros.RosJointState, ros.MarkerArray, ros.DiagnosticArray, ContactArray),
+        ros.PoseWithCovarianceStamped,
+    ],
     ids=ros_type_name,
 )
 def test_definitions_hash_as_in_ros(kind: type[IdlStruct], store: Any) -> None:
@@ -263,6 +266,29 @@ class RelayedHand:
 
     def forces_n(self, name: str) -> list[float]:
         return self.topics.forces_n(f"right/{name}wrench")
+
+
+def test_the_pose_of_an_object_is_published_while_it_is_determined() -> None:
+    pose = wire.ObjectPose(
+        weight=0.9,
+        palm_position_m=[0.07, 0.0, 0.03],
+        palm_quaternion=[0.0, 0.6, 0.0, 0.8],
+        palm_covariance=[1e-6 * k for k in range(36)],
+    )
+    percept = wire.Percept(
+        *(1, 1, 1, 10**10, "right", "object", "", 0, "estimated", "bolt", 0.9),
+        *({"bolt": 0.9}, {}, {}, "", False),
+        poses=(pose, pose | {"weight": 0.1}),
+    )
+    hand = RelayedHand()
+    hand.relay.relay(percept)
+    hand.relay.relay(replace(percept, state="undetermined"))
+    (sent,) = hand.topics.sent["right/object"]
+    assert sent.header.frame_id == "robot1/palm"
+    placed = sent.pose.pose
+    assert [placed.position.x, placed.position.y, placed.position.z] == pose["palm_position_m"]
+    assert [placed.orientation.y, placed.orientation.w] == [0.6, 0.8]
+    assert list(sent.pose.covariance) == pose["palm_covariance"]
 
 
 HELD = replace(LOCATED, force_vector_status="not_computed")

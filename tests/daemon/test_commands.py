@@ -20,7 +20,7 @@ from handtouch.calibration.calibration import (
     LawParameters,
 )
 from handtouch.client import request
-from handtouch.config import ConfigError, Deployment, parse
+from handtouch.config import ConfigError, Deployment, ObjectTable, parse
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.scene import MAX_CLIENTS
 from handtouch.daemon.control import MAX_REPLY_BYTES
@@ -29,10 +29,21 @@ from handtouch.daemon.table_cache import build_pad_model
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000
-COMMANDS = ("status", "snapshot", "scene", "tare", "calibrate", "enable", "disable", "reload", "log")
+COMMANDS = (
+    "status",
+    "snapshot",
+    "scene",
+    "tare",
+    "calibrate",
+    "enable",
+    "disable",
+    "reload",
+    "object",
+    "log",
+)
 KEYS = (
     *("pads", "pad", "name", "links", "outputs", "rate_hz", "lease_s", "reset", "gains"),
-    *("offset_counts", "law", "dry_run", "level", "anything"),
+    *("offset_counts", "law", "dry_run", "level", "hand", "table", "none", "anything"),
 )
 VALUES = st.recursive(
     st.none()
@@ -44,6 +55,10 @@ VALUES = st.recursive(
     lambda inner: st.lists(inner, max_size=4),
     max_leaves=8,
 )
+
+
+BALL: dict[str, Any] = {"kind": "sphere", "diameter_mm": 60.0}
+MESH: dict[str, Any] = {"kind": "mesh", "file": "/etc/passwd"}
 
 
 class Bench:
@@ -161,6 +176,18 @@ def test_any_arguments_get_a_reply_and_ticks_continue(
         ("calibrate", {"pad": "plane", "name": "c", "gains": [1] * 4, "offset_counts": [2e4] * 4}, "half"),
         ("calibrate", {"pad": "plane", "gains": [1] * 4}, "name is missing"),
         ("calibrate", {"pad": "plane", "name": "c", "law": {"alpha": 1.5}}, "contact_ohm_mm2 is missing"),
+        ("object", {"hand": "left"}, "hand = 'left': there is no such hand; known: h"),
+        (
+            "object",
+            {"hand": "h", "name": "mug"},
+            "name = 'mug': the deployment has no such object; known: none",
+        ),
+        (
+            "object",
+            {"hand": "h", "name": "mug", "table": {"shape": MESH}},
+            "a mesh must be stated in the deployment",
+        ),
+        ("object", {"hand": "h", "name": "a=b", "table": {"shape": BALL}}, "must have no ="),
         ("log", {"level": "loud"}, 'level = "loud": must be "debug", "info", "warning" or "error"'),
         ("log", {"level": msgpack.Timestamp(1)}, 'level = "extension type": must be'),
         ("status", {"verbose": True}, "verbose = true: unknown argument"),
@@ -421,3 +448,19 @@ def test_the_session_is_random_and_exact_as_a_double(served: Bench, tmp_path: Pa
     again.daemon.close()
     assert sessions[0] != sessions[1]
     assert all(0 <= session < 2**53 and abs(session - time.time()) > 1e6 for session in sessions)
+
+
+def test_an_object_is_stated_over_control_until_the_deployments_object_changes(served: Bench) -> None:
+    assert served.ask("object", hand="h")["name"] is None
+    answer = served.ask("object", hand="h", name="ball", table={"shape": BALL})
+    assert (answer["name"], answer["table"]) == ("ball", {"shape": BALL})
+    before = served.deployment
+    served.reloaded = lambda: before
+    assert served.ask("reload")["ok"]
+    assert served.ask("object", hand="h")["name"] == "ball"
+    hand = before.hands[0].model_copy(update={"object": "rod"})
+    rod = ObjectTable.model_validate({"shape": {"kind": "cylinder", "diameter_mm": 9.0, "length_mm": 90.0}})
+    served.reloaded = lambda: before.model_copy(update={"hands": (hand,), "objects": {"rod": rod}})
+    assert set(served.ask("reload")["tables"]) == {"object.rod", "hand h"}
+    assert served.ask("object", hand="h")["name"] == "rod"
+    assert served.ask("object", hand="h", none=True)["name"] is None

@@ -136,6 +136,28 @@ def test_two_contacts_of_a_pad_are_two_more_points_with_their_forces() -> None:
     assert [text["text"] for text in entity["texts"]] == ["0.75 N", "index_distal 1.00 N"]
 
 
+def test_hypotheses_about_an_object_are_drawn_in_the_palm_and_a_determined_pose_is_published() -> None:
+    covariance = np.diag([4e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-2])
+    pose = {"palm_position_m": [0.07, 0.0, 0.03], "palm_quaternion": [0.0, 0.0, 0.0, 1.0]}
+    pose |= {"weight": 0.8, "palm_covariance": covariance.ravel().tolist()}
+    percept = {
+        "kind": "object",
+        "hand": "right",
+        "state": "estimated",
+        "poses": [pose, pose | {"weight": 0.2}],
+    }
+    foxglove = configured()
+    made = foxglove.convert("percept/right/object", percept, 10 * SECOND_NS)
+    placed = next(fields(message) for message in made if message.topic == "/handtouch/object/right")
+    assert (placed["frame_id"], placed["pose"]["position"]["x"]) == ("palm", pytest.approx(0.07))
+    (entity,) = next(fields(message) for message in made if message.topic == SCENE_TOPIC)["entities"]
+    longest_m = max(max(sphere["size"][key] for key in "xyz") for sphere in entity["spheres"])
+    assert longest_m == pytest.approx(2 * 2e-3 * 7.815**0.5)
+    assert len(entity["spheres"]) == len(entity["arrows"]) == 2
+    open_made = foxglove.convert("percept/right/object", percept | {"state": "undetermined"}, 11 * SECOND_NS)
+    assert [message.topic for message in open_made] == [SCENE_TOPIC]
+
+
 @pytest.mark.parametrize("reason", ["stale", "lost", "faulted", "stopped"])
 def test_a_contact_of_a_pad_that_is_not_sampled_stays_without_a_force_until_it_is(reason: str) -> None:
     foxglove = configured()

@@ -373,6 +373,25 @@ def test_percepts_are_shown_at_their_pad_while_the_contact_lasts() -> None:
     assert model.values.changes_since(0)["percepts/right/index_distal"] is None  # another contact
 
 
+def test_hypotheses_about_an_object_are_drawn_by_weight_ellipsoid_and_axis() -> None:
+    covariance = np.diag([4e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-2]).ravel().tolist()
+    pose = wire.ObjectPose(
+        weight=0.9,
+        palm_position_m=[0.07, 0.0, 0.03],
+        palm_quaternion=[0.0, 0.0, 0.0, 1.0],
+        palm_covariance=covariance,
+    )
+    model = PageModel()
+    model.add_message(frame({DISTAL: 7}))
+    model.add_message(percept("object", "bolt", link="", contact_id=0, poses=(pose,)))
+    model.update_values(True)
+    (drawn,) = model.values.changes_since(0)["percepts/right/"]["poses"]
+    assert (drawn["weight"], drawn["position_m"], drawn["z"]) == (0.9, [0.07, 0.0, 0.03], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(
+        np.abs(drawn["axes_m"]).max(axis=0), np.sqrt(7.815) * np.array([2e-3, 1e-3, 1e-3])
+    )
+
+
 def test_percepts_are_cleared_when_the_daemon_disconnects() -> None:
     model = PageModel()
     model.add_message(frame({DISTAL: 7}))

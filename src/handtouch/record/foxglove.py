@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from functools import cache
 from typing import Any, Protocol
 
+import numpy as np
 from foxglove import Schema
 from foxglove.messages import (
     ArrowPrimitive,
@@ -22,6 +23,7 @@ from foxglove.messages import (
     Log,
     LogLevel,
     Pose,
+    PoseInFrame,
     Quaternion,
     SceneEntity,
     SceneEntityDeletion,
@@ -31,11 +33,13 @@ from foxglove.messages import (
     Timestamp,
     Vector3,
 )
+from scipy.spatial.transform import Rotation
 
 from handtouch.hand import urdf
 from handtouch.record.link_frames import LinkFrames, LinkTransform, quaternion
 from handtouch.record.schemas import MessageFormat, SceneMessage
 
+OBJECT_TOPIC = "/handtouch/object"
 SCENE_TOPIC, LOG_TOPIC, FRAMES_TOPIC, HAND_TOPIC = (
     "/handtouch/scene",
     "/handtouch/log",
@@ -55,6 +59,8 @@ _COLOR_OF_STATUS = {
 _DEFAULT_COLOR = Color(r=0.6, g=0.6, b=0.6, a=0.9)
 _TEXT_COLOR = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _BODY_COLOR = Color(r=0.36, g=0.4, b=0.46, a=1.0)
+_ELLIPSOID_CHI2 = 7.815
+"""95 % of a normal distribution in three dimensions"""
 _NO_ROTATION = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -101,6 +107,9 @@ class FoxgloveConverter:
         elif prefix == "config":
             self._links.set_deployment(payload)
             self._hand_wall_ns = 0
+        elif prefix == "percept" and payload["kind"] == "object":
+            frame = self._links.palm_frame(payload["hand"])
+            made += _object_messages(payload, frame, t_ns) if frame else []
         elif prefix == "joints":
             self._links.set_joints(payload)
             if self._links_known:
@@ -196,6 +205,45 @@ def _body_entity(frame: str, shapes: list[urdf.BodyShape], t_ns: int) -> SceneEn
         spheres=spheres,
         cylinders=cylinders,
     )
+
+
+def _object_messages(percept: dict[str, Any], frame: str, t_ns: int) -> list[SceneMessage]:
+    """Return the likeliest pose of a known object while it is determined, and all hypotheses as a scene."""
+    poses = percept.get("poses", ())
+    made = []
+    if percept["state"] == "estimated" and poses:
+        pose = _pose(poses[0]["palm_position_m"], poses[0]["palm_quaternion"])
+        placed = PoseInFrame(timestamp=_time(t_ns), frame_id=frame, pose=pose)
+        made.append(_encoded(f"{OBJECT_TOPIC}/{percept['hand']}", placed))
+    spheres, arrows = [], []
+    for hypothesis in poses:
+        color = Color(r=1.0, g=0.9, b=0.6, a=0.1 + 0.6 * hypothesis["weight"])
+        variances, axes = np.linalg.eigh(np.reshape(hypothesis["palm_covariance"], (6, 6))[:3, :3])
+        axes[:, 0] *= np.linalg.det(axes)  # right-handed
+        wide = 2 * np.sqrt(np.maximum(variances, 0.0) * _ELLIPSOID_CHI2)
+        ellipsoid = _pose(hypothesis["palm_position_m"], quaternion(axes))
+        spheres.append(SpherePrimitive(pose=ellipsoid, size=_vector(wide.tolist()), color=color))
+        z = Rotation.from_quat(hypothesis["palm_quaternion"]).apply([0.0, 0.0, 1.0])
+        arrows.append(
+            ArrowPrimitive(
+                pose=_pose(hypothesis["palm_position_m"], _rotation_from_x(z.tolist())),
+                shaft_length=0.03,
+                shaft_diameter=0.002,
+                head_length=0.008,
+                head_diameter=0.005,
+                color=color,
+            )
+        )
+    entity = SceneEntity(
+        timestamp=_time(t_ns),
+        frame_id=frame,
+        id=f"object in {percept['hand']}",
+        lifetime=_CONTACT_LIFETIME,
+        frame_locked=True,
+        spheres=spheres,
+        arrows=arrows,
+    )
+    return [*made, _encoded(SCENE_TOPIC, SceneUpdate(entities=[entity]))]
 
 
 def _contact_entity(name: str, frame: str, contact: dict[str, Any], t_ns: int) -> SceneEntity:

@@ -39,18 +39,21 @@ class LinkFrames:
     def __init__(self) -> None:
         self._hands: dict[str, list[str]] = {}
         self._robots: dict[str, urdf.RobotDescription] = {}
+        self._palms: dict[str, str] = {}
         self._joints: dict[str, dict[str, float]] = {}
 
     def set_deployment(self, payload: dict[str, Any]) -> None:
         """Read the URDFs of a deployment; a malformed one is ignored."""
         tables = json.loads(payload["deployment"])
         self._robots.clear()
+        self._palms.clear()
         for hand in tables["hand"]:
             data = payload["files"].get(hand.get("urdf"))
             if data is None:
                 continue
             try:
-                self._robots[hand["name"]] = urdf.parse_urdf(data, Path(hand["urdf"]))
+                robot = self._robots[hand["name"]] = urdf.parse_urdf(data, Path(hand["urdf"]))
+                self._palms[hand["name"]] = hand.get("palm_link") or robot.root
             except urdf.UrdfError:  # the daemon has reported it
                 continue
 
@@ -66,6 +69,10 @@ class LinkFrames:
     def frame_name(self, hand: str, link: str) -> str:
         """Return the name of a link's frame; with the hand's name if there are several."""
         return link if len(self._hands) < 2 else f"{hand}/{link}"
+
+    def palm_frame(self, hand: str) -> str:
+        """Return the name of a hand's palm frame; empty without a URDF."""
+        return self.frame_name(hand, self._palms[hand]) if hand in self._palms else ""
 
     def frames(self, moved: str = "") -> Iterator[LinkTransform]:
         """Yield all frames, or the movable ones of a hand that moved."""

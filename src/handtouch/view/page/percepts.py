@@ -7,10 +7,15 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
 from handtouch import wire
 from handtouch.view.message_lines import percept_summary
 
 _KINDS = ("motion", "shape", "friction", "object")
+_ELLIPSOID_CHI2 = 7.815
+"""95 % of a normal distribution in three dimensions"""
 _DEFAULT_LABELS = ("sticking", "point")
 """Usual classes: listed, but not shown next to the pad."""
 _PERCEPT_TIMEOUT_NS = 3_000_000_000
@@ -23,6 +28,20 @@ class _HeldPercept(NamedTuple):
     label: str
     text: str
     missing: str
+    poses: list[dict[str, Any]]
+
+
+def _drawn_pose(pose: wire.ObjectPose) -> dict[str, Any]:
+    """Return a hypothesis as it is drawn in the palm: half axes of the position's 95 % ellipsoid, and z."""
+    variances, axes = np.linalg.eigh(np.reshape(pose["palm_covariance"], (6, 6))[:3, :3])
+    half_m = np.sqrt(np.maximum(variances, 0.0) * _ELLIPSOID_CHI2)
+    rotation = Rotation.from_quat(pose["palm_quaternion"]).as_matrix()
+    return {
+        "weight": pose["weight"],
+        "position_m": pose["palm_position_m"],
+        "axes_m": (axes * half_m).T.tolist(),
+        "z": rotation[:, 2].tolist(),
+    }
 
 
 class PerceptSummaries:
@@ -42,6 +61,7 @@ class PerceptSummaries:
             percept.label if is_request or shown else "",
             percept_summary(percept),
             f"{percept.kind}: {percept.reason}" if percept.state == "undetermined" else "",
+            [_drawn_pose(pose) for pose in percept.poses],
         )
 
     def current(self, contacts: dict[str, int], now_ns: int) -> dict[str, dict[str, Any] | None]:
@@ -67,7 +87,8 @@ class PerceptSummaries:
             return None
         self._pads[key] = valid
         estimates = [valid[kind] for kind in _KINDS if kind in valid]
-        return {
+        poses = [pose for held in estimates for pose in held.poses]
+        return ({"poses": poses} if poses else {}) | {
             "labels": [held.label for held in estimates if held.label],
             "lines": [held.text for held in estimates if held.text],
             "requests": [held.text for kind, held in valid.items() if kind not in _KINDS],

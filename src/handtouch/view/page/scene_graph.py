@@ -50,6 +50,8 @@ class _SceneGraph:
         self.faces: list[tuple[FloatArray, FloatArray]] = []
         """centre of each pad and its normal"""
         self.problems: list[str] = []
+        self.palms: dict[str, int] = {}
+        """node of each hand's palm, of hands with a URDF"""
 
     def add_node(self, parent: int, pose: Pose, **joint: Any) -> int:
         rotation, translation = pose
@@ -115,6 +117,7 @@ def scene_of(deployment: Deployment, files: dict[str, bytes]) -> dict[str, Any]:
         "columns": [scene.columns[k] for k in np.argsort(middle)],
         "camera": camera,
         "problems": scene.problems,
+        "palms": scene.palms,
     }
 
 
@@ -135,6 +138,7 @@ def _add_robot(
     waiting = list(robot.joints.values())
     while waiting:  # a parent may come later in the file than its child
         waiting = [joint for joint in waiting if not _add_joint(scene, hand, joint, numbers)]
+    scene.palms[hand.name] = numbers[hand.palm_link or robot.root]
     missing: list[str] = []
     for link, number in numbers.items():
         for mesh in _body_meshes(robot, link, missing):

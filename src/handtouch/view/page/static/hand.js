@@ -13,6 +13,7 @@ const MAGNIFICATIONS = [100, 30, 10, 3, 1]; // of ellipses
 const LARGEST_ELLIPSE_M = 0.02; // half axis as drawn; what is larger is cut, and paler
 const LINE_PX = 17, PADDING_PX = 12, EDGE_PX = 4; // of a label
 const FAULTS = ["stale", "lost", "faulted", "unreliable"]; // statuses that are labelled
+const OBJECT_AXIS_M = 0.04; // length of the drawn z axis of a known object
 const MAX_FULL_LABELS = 6; // contacts labelled with all percepts; beyond, with motion only
 const MAX_PIXEL_RATIO = 1.5; // canvas pixels per page pixel
 
@@ -108,7 +109,17 @@ export class HandView {
     this.magnified = magnificationOf(touched.map(([, contact]) => contact), this.magnified);
     for (const [pad, contact] of touched) this.drawContact(this.poses[pad.node], contact, false);
     for (const [pad, contact] of touched) this.drawContact(this.poses[pad.node], contact, true);
+    for (const [hand, palm] of Object.entries(this.scene.palms)) for (const pose of state.percepts[`${hand}/`]?.poses ?? []) this.drawObject(this.poses[palm], pose);
     this.label(state, touched);
+  }
+
+  // Draws a hypothesis about a known object: the 95 % ellipsoid of its position and its z axis; the likelier, the more opaque.
+  drawObject(palm, pose) {
+    const { renderer } = this, at = m.point(palm, pose.position_m), z = m.unit(m.direction(palm, pose.z)), [x, y] = m.across(z);
+    const style = { lit: 0, alpha: 0.1 + 0.6 * pose.weight, nearer: CONTACT_NEARER_M, through: true };
+    const [a, b, c] = pose.axes_m.map((axis) => m.direction(palm, axis));
+    renderer.draw(this.ball, m.frame(a, b, c, at), rgb(ELLIPSE), style);
+    renderer.draw(this.shaft, m.frame(m.scale(x, OBJECT_AXIS_M / 40), m.scale(y, OBJECT_AXIS_M / 40), m.scale(z, OBJECT_AXIS_M), at), rgb(ELLIPSE), style);
   }
 
   // Draws position, force and 95 % ellipse; what the hand hides shines through.
