@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,14 @@ TEXT = deployment_text(
 )
 
 
+@cache
+def parsed() -> config.Deployment:
+    return config.parse(TEXT)
+
+
 def deployed(**sheet: float) -> config.Deployment:
     """The pad, its sheet as the file says but for what is given."""
-    deployment = config.parse(TEXT)
+    deployment = parsed()
     made = deployment.sheets["s"].model_copy(update=sheet)
     return deployment.model_copy(update={"sheets": {"s": made}})
 
@@ -115,13 +121,16 @@ class Table:
         return output
 
 
-def fitted(readings: list[WeightReading], radius_std: float = 0.01, **sheet: float) -> LawFit:
+@cache
+def circuit_model(**sheet: float) -> PadCircuitModel:
     deployment = deployed(**sheet)
-    circuit_model = PadCircuitModel(deployment, deployment.hands[0].pads[0])
-    circuits = [circuit_model.circuit_at(reading.position_m, 1e-4) for reading in readings]
-    return fit_law(
-        readings, circuits, law_of(circuit_model.sheet), circuit_model.sheet.reference_kpa * 1e3, radius_std
-    )
+    return PadCircuitModel(deployment, deployment.hands[0].pads[0])
+
+
+def fitted(readings: list[WeightReading], radius_std: float = 0.01, **sheet: float) -> LawFit:
+    model = circuit_model(**sheet)
+    circuits = [model.circuit_at(reading.position_m, 1e-4) for reading in readings]
+    return fit_law(readings, circuits, law_of(model.sheet), model.sheet.reference_kpa * 1e3, radius_std)
 
 
 def weights(text: str = FIVE, repeats: int = 3) -> list[Weight]:
