@@ -62,12 +62,15 @@ def test_gravity_on_a_link_is_that_of_the_base_rotated_by_the_joints() -> None:
     np.testing.assert_allclose(rotated[0], POSES.pose_in_base(0).rotation.T @ rig.down, atol=1e-12)
 
 
-def test_gravity_is_updated_after_a_rotation_and_once_per_baseline_block() -> None:
+def test_gravity_is_updated_after_a_rotation_and_every_20_ms() -> None:
     rig = JointRig()
     rig.joints(0.3)
     assert rig.step() is not None
     rig.states.add_state(rig.t_ns + 50 * MS, NAMES, np.full(len(NAMES), 0.6))
-    assert rig.gravity.update_directions(rig.t_ns + 50 * MS) is None
+    assert rig.gravity.update_directions(rig.t_ns + 19 * MS) is None
+    assert rig.gravity.update_directions(rig.t_ns + 20 * MS) is not None
+    rig.joints(0.3)
+    assert rig.step() is not None
     rig.joints(0.3)
     assert rig.step() is None
     rig.joints(0.32)

@@ -10,12 +10,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.baseline import BLOCK_DURATION_NS
 from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 
 FloatArray = NDArray[np.float64]
+_INTERVAL_NS = 20_000_000
+"""Least time between two updates: a hand that turns over once a second turns by 7 degrees meanwhile."""
 _MIN_CHANGE = 0.01
 """Least change of a joint [rad, m] or of gravity in the base frame that is processed."""
 
@@ -39,10 +40,10 @@ class GravityTracker:
 
     def update_directions(self, now_ns: int) -> FloatArray | None:
         """Return the direction of gravity in each link's frame (n, 3), NaN where unknown; None if no link
-        turned, or less than one baseline block after the last call that checked."""
+        turned, or it was checked less than 20 ms ago."""
         if now_ns < self._next_ns:
             return None
-        self._next_ns = now_ns + BLOCK_DURATION_NS
+        self._next_ns = now_ns + _INTERVAL_NS
         turned = [self._update_hand(number, now_ns) for number in range(len(self._robots.hands))]
         return self._link_directions.copy() if any(turned) else None
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.problems import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch, discs
 from handtouch.simulate.gripper_objects import (
     GRIPPER_OBJECTS,
@@ -149,6 +150,8 @@ class GripperStimulus:
     faults = ()
     node_faults = ()
     node_replacements = ()
+    skin: Skin | None = None
+    turns: Sequence[BaseTurn] = ()
     repeat = False
     duration_s = math.inf
 

@@ -11,12 +11,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from handtouch import config
 from handtouch.client.robot import Robot
 from handtouch.config import Deployment
 from handtouch.hand import urdf
 from handtouch.simulate.stimulus import JointTrajectory
 
 _PERIOD_S = 0.01
+Vector = tuple[float, float, float]
 _logger = logging.getLogger(__name__)
 
 
@@ -24,7 +26,8 @@ class JointFeed:
     """Sends the joint states of every hand with a URDF, from `start` until `close`.
 
     `trajectory` returns the reported motion of a hand's joints, or None; `scenario_time_s` is the time in the
-    scenario. If the daemon rejects the connection, that is logged once and the thread ends.
+    scenario, at which `gravity` returns a hand's direction of gravity in its base, or None. If the daemon
+    rejects the connection, that is logged once and the thread ends.
     """
 
     def __init__(
@@ -34,7 +37,9 @@ class JointFeed:
         scenario_time_s: Callable[[], float],
         endpoint: str,
         key: Path | str | None = None,
+        gravity: Callable[[config.HandTable, float], Vector | None] = lambda _, __: None,
     ) -> None:
+        self._gravity = gravity
         self._scenario_time_s, self._endpoint, self._key = scenario_time_s, endpoint, key
         self._hands = [
             (hand, joints)
@@ -70,4 +75,4 @@ class JointFeed:
                 hand.joint_names.get(name, hand.joint_prefix + name): position
                 for name, position in joints.positions_at(t_s).items()
             }
-            robot.send_joints(hand.name, positions, t_ns=sample_ns)
+            robot.send_joints(hand.name, positions, t_ns=sample_ns, gravity=self._gravity(hand, t_s))

@@ -16,6 +16,7 @@ from handtouch.config.base import Table
 from handtouch.config.problems import ConfigError, Problem, problems_of
 from handtouch.config.toml_text import parse_toml, read_text
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import FAULTS, INFLUENCES, AnyFault, Fault
 from handtouch.simulate.joints import JointMotion, ScenarioJoints
@@ -43,6 +44,10 @@ class Scenario(Table):
     motions: Annotated[tuple[JointMotion, ...], Field(strict=False)] = Field(
         (), alias="joint", description="joint motion; without any the joints don't move"
     )
+    skin: Skin | None = Field(None, description="weight of the skin; without it, it weighs nothing")
+    turns: Annotated[tuple[BaseTurn, ...], Field(strict=False)] = Field(
+        (), alias="turn", description="turns of the hand's base"
+    )
     repeat: bool = Field(False, description="start again after the end")
     pause_s: float = Field(1.0, ge=0, description="time from the last touch to the end, or to the repetition")
 
@@ -63,6 +68,8 @@ class Scenario(Table):
                 "touch": ScenarioTouch,
                 "swap": NodeReplacement,
                 "joint": JointMotion,
+                "skin": Skin,
+                "turn": BaseTurn,
             }
             raise ConfigError(file, problems_of(raw, error, tables, _KINDS)) from error
         return scenario
@@ -112,8 +119,9 @@ class Scenario(Table):
         )
 
     def joint_trajectory(self, robot: RobotDescription) -> ScenarioJoints | None:
-        """Return the joint motion of a hand; None if its joints don't move."""
-        return ScenarioJoints(robot.joints.values(), self.motions) if self.motions else None
+        """Return the joint motion of a hand; None if neither its joints nor its base move."""
+        moves = self.motions or self.turns
+        return ScenarioJoints(robot.joints.values(), self.motions) if moves else None
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the contacts of all pads at `t_s`."""

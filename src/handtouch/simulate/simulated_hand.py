@@ -25,6 +25,7 @@ from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.device import Device, DeviceBus, Sampler
 from handtouch.device.inputs import MAX_CHANNELS
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.base_motion import gravity_in_base
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.joint_feed import JointFeed
@@ -124,7 +125,10 @@ class SimulatedHand:
             true = stimulus.joint_trajectory(robot)
             return ReportedJoints(true, robot, self._world, hand) if true else None
 
-        feed = JointFeed(deployment, reported, scenario_time_s, endpoint)
+        def gravity(hand: config.HandTable, t_s: float) -> tuple[float, float, float] | None:
+            return gravity_in_base(stimulus.turns, hand.gravity, t_s)
+
+        feed = JointFeed(deployment, reported, scenario_time_s, endpoint, gravity=gravity)
         feed.start()
         self._resources.callback(feed.close)
 

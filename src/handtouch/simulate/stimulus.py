@@ -17,6 +17,7 @@ from pydantic import Field
 from handtouch.config.base import Table
 from handtouch.config.tables import Name, PositivePerChannel, Unsigned32
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.node_faults import NodeFault
@@ -89,6 +90,14 @@ class Stimulus(Protocol):
     @property
     def duration_s(self) -> float:
         """Duration of one pass."""
+
+    @property
+    def skin(self) -> Skin | None:
+        """Skin that presses on the sheets by its weight; None: not simulated."""
+
+    @property
+    def turns(self) -> Sequence[BaseTurn]:
+        """Turns of the base."""
 
     @property
     def touch_links(self) -> Sequence[str]:

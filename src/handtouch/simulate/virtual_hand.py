@@ -96,6 +96,7 @@ class VirtualHand:
             for number, row in enumerate(self.virtual_pads)
             if row.faults or row.replacement_gains or row.circuit.states
         ]
+        self._skin_rows = [number for number, row in enumerate(self.virtual_pads) if row.skin]
         self._touch_pads = [
             [
                 (number, stimulus.touch_patch(index, world.contact(row.sheet, index).patch))
@@ -120,6 +121,12 @@ class VirtualHand:
         if contacts := [contact for contact in all_contacts if contact.row not in special]:
             solved = self._solve(contacts, t_s)
             counts[solved.rows] += solved.currents_a * gains[solved.rows]
+        for row in self._skin_rows:
+            pad = self.virtual_pads[row]
+            currents, own = pad.skin_currents(np.array([t_s]))[0], len(pad.limits)
+            counts[row, :own] += (
+                currents * pad.counts_per_ampere * pad.drift.gain_ratio(np.array([t_s]))[0, 0]
+            )
         readings = self.quantise(counts)
         for row in special:
             own = self.counts(row, [t_s])[0]

@@ -27,6 +27,7 @@ from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
+from handtouch.simulate.skin import SkinLoad
 from handtouch.simulate.stimulus import PadStimulus, Stimulus
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.uneven_sheet import uneven_sheet_maps
@@ -69,6 +70,10 @@ class VirtualPad:
     """Period after which the scenario repeats; infinite: it doesn't."""
     shear: VirtualShear | None
     """Shear pad beneath it."""
+    skin: SkinLoad | None
+    """Skin on it that presses by its weight."""
+    duration_s: float
+    """Duration of one pass of the scenario."""
 
     @classmethod
     def build(
@@ -134,6 +139,8 @@ class VirtualPad:
             hidden.sheet_law,
             repeat_s,
             shear,
+            SkinLoad.of_pad(deployment, hand, pad, circuit, stimulus, world.mount(hand, pad)),
+            stimulus.duration_s,
         )
 
     @cached_property
@@ -194,6 +201,8 @@ class VirtualPad:
 
     def prepare(self) -> None:
         """Solve the sheet for all contacts and faults in advance, so that a live hand doesn't pause."""
+        if self.skin:
+            self.skin.prepare(self.duration_s)
         if not self.has_single_contacts_only:
             begins = [fault.from_s for fault in self.faults]
             changes = [*self.touches.event_times_s[1], *begins]
@@ -220,6 +229,8 @@ class VirtualPad:
         scenario_s = self._scenario_time_s(times_s)
         force_ratio, supply_ratio = self.force_ratio(times_s), self.drift.supply_ratio(times_s)
         amperes = self.circuit.currents(scenario_s, self.touches, faults, force_ratio, supply_ratio)
+        if self.skin:
+            amperes += self.skin_currents(times_s)
         for fault in faults:
             if order := fault.channel_permutation:
                 amperes = np.where(fault.is_active(scenario_s)[:, None], amperes[:, order], amperes)
@@ -244,6 +255,12 @@ class VirtualPad:
             fault.override_counts(affected, self.limits)
             readings[active] = affected
         return readings
+
+    def skin_currents(self, times_s: FloatArray) -> FloatArray:
+        """Return the currents (n, m) [A] of the skin's weight at times (n,) since the start."""
+        if self.skin is None:
+            return np.zeros((len(times_s), len(self.limits)))
+        return self.skin.currents(self._scenario_time_s(times_s)) * self.drift.supply_ratio(times_s)[:, None]
 
     def _apply_stuck_channel(self, fault: StuckChannel, times_s: FloatArray, counts: CountArray) -> None:
         active = np.flatnonzero(fault.is_active(self._scenario_time_s(times_s)))

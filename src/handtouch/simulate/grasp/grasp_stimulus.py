@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handtouch.config import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
+from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch, discs
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
@@ -78,6 +79,8 @@ class GraspStimulus:
     faults: Sequence[Fault] = ()
     node_faults: Sequence[NodeFault] = ()
     node_replacements: Sequence[NodeReplacement] = ()
+    skin: Skin | None = None
+    turns: Sequence[BaseTurn] = ()
 
     @classmethod
     def from_grasp(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.contact_patch import discs as evenly_pressed
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
@@ -193,6 +194,8 @@ class _NoStimulus:
     faults = ()
     node_faults = ()
     node_replacements = ()
+    skin: Skin | None = None
+    turns: Sequence[BaseTurn] = ()
     repeat = False
     duration_s = np.inf
     touch_links: Sequence[str] = ()
