@@ -238,7 +238,7 @@ def test_replaced_node_is_quarantined_at_once(rig: Rig) -> None:
     assert model.quarantined.tolist() == [False] * 3
     assert rig.supervisor.health_fields(0) == {
         "calibration_state": "calibrated", "calibration_id": "21-1",
-        "calibration_progress": "", "diagnoses": (),
+        "calibration_progress": "", "diagnoses": (), "least_begin_threshold_n": None,
     }  # fmt: skip
 
 

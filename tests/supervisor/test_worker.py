@@ -418,3 +418,20 @@ def test_sheet_state_of_another_version_restores_what_is_known_of_it(
     messages = make_worker(bench, tmp_path / "c.db").process_message(bench.introduce([11, 12, 13]), NOW)
     (update,) = calibrations(messages, 0)
     assert (update.back_n, update.learned) == (0.4 if restored else None, ())
+
+
+def test_the_least_threshold_of_an_untouched_pad_is_known_after_a_minute_and_forgotten_with_its_node(
+    bench: Bench, tmp_path: Path
+) -> None:
+    worker, rng = make_worker(bench, tmp_path / "c.db"), np.random.default_rng(8)
+    messages = worker.process_message(bench.introduce([1, 2, 3], [1, 2, 3]), NOW)
+    rest = np.zeros((200, 3), np.uint32)
+    for number in range(72):
+        noise = rng.normal(0, [[[1.0], [1.0], [3.0]]], (200, 3, 4))
+        messages += worker.process_message(bench.block(noise, rest, number * 200 * PERIOD_NS), NOW)
+    found = [assessment(messages, pad).least_begin_counts for pad in range(3)]
+    rounded = np.sqrt(np.square([1.0, 1.0, 3.0]) + 1 / 12)
+    two_of_four = rounded * np.sqrt(4 / 2)  # the mean of two samples of the sum of four channels
+    np.testing.assert_allclose(np.array(found, float), 5.55 * two_of_four, rtol=0.1)
+    messages = worker.process_message(bench.introduce([1, 9, 3], [1, 2, 3]), NOW)
+    assert assessment(messages, 1).least_begin_counts is None

@@ -26,7 +26,7 @@ from handtouch.procedures.commission.record import CommissioningRecord
 from handtouch.procedures.commission.sample_source import open_sample_source
 from handtouch.procedures.dialogue import open_dialogue
 
-_COLUMN_TITLES = ("pad", "node", "serial", "electrodes", "noise", "result")
+_COLUMN_TITLES = ("pad", "node", "serial", "electrodes", "noise", "least threshold", "result")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -123,6 +123,7 @@ def _as_json(procedure: CommissioningProcedure, record: CommissioningRecord) -> 
                 "serial": (node.serial or None) if known else None,
                 "electrodes": outcome.electrodes,
                 "noise_counts": float(np.max(rest.std)) if rest is not None and rest.samples else None,
+                "least_begin_threshold_n": procedure.least_begin_threshold_n(row),
                 "problems": outcome.problems,
             }
         )
@@ -191,7 +192,7 @@ def _cells(procedure: CommissioningProcedure, row: int, outcome: PadOutcome) -> 
     node, rest = procedure.node_of(row), procedure.rest_of(row)
     known = outcome.slot is not None
     configured = procedure.configured_noise_counts(row)
-    noise = "-"
+    noise, least = "-", procedure.least_begin_threshold_n(row)
     if rest is not None and rest.samples:
         noise = f"{float(np.max(rest.std)):.1f} ({configured:g})"
     return (
@@ -200,5 +201,6 @@ def _cells(procedure: CommissioningProcedure, row: int, outcome: PadOutcome) -> 
         str(node.serial) if known and node.serial else "-",
         " ".join(outcome.electrodes) if outcome.electrodes else "-",
         noise,
+        "-" if least is None else f"{least:.2g} N",
         outcome.result.value,
     )

@@ -181,6 +181,8 @@ def _tare_lines(answer: Reply) -> Iterator[str]:
     for pad in answer["pads"]:
         counts = ", ".join(f"{offset:.1f}" for offset in pad["offset_counts"])
         done = f"tared at {counts} counts ({pad['samples']} samples)"
+        if least := pad.get("least_begin_threshold_n"):
+            done += f"; begin_threshold_n {pad['begin_threshold_n']:g}, least {least:.2g}"
         yield f"{pad['hand']}/{pad['link']}: {done if pad['tared'] else 'not tared: ' + pad['reason']}"
 
 

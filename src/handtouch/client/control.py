@@ -37,6 +37,10 @@ class TareResult(TypedDict):
     """active now"""
     mean_counts: NotRequired[list[float]]
     std_counts: NotRequired[list[float]]
+    begin_threshold_n: NotRequired[float]
+    """in the deployment"""
+    least_begin_threshold_n: NotRequired[float | None]
+    """least with one false contact in 100 hours, by the noise of this second and the drift so far"""
 
 
 class ActiveScene(TypedDict):

@@ -35,7 +35,7 @@ IntArray = npt.NDArray[np.intp]
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md measures what they yield.
 BLOCK_DURATION_NS = 97_000_000  # no multiple of a period: rounding of stamps moves no sample to another block
 _MAX_PAUSE_NS = 3600 * 10**9  # longer: another clock
-_TRACKING_TIME_S = 10.0  # time constant of offsets
+TRACKING_TIME_S = 10.0  # time constant of offsets
 _NOISE_TIME_S = 60.0  # time constant of the noise estimate
 _NOISE_PERIOD_BLOCKS = 10  # blocks per update of the noise estimate
 _MIN_VARIANCE_SAMPLES = 4  # in a block
@@ -294,9 +294,9 @@ class Baseline:
         """Move offsets towards the readings: do/dt = excess / time constant, up to the maximum rate unless
         they fall. Return the change (n, c). Exact for a constant reading, whatever the intervals."""
         excess = np.abs(mean) @ self._ones
-        linear = self._max_rate * _TRACKING_TIME_S
+        linear = self._max_rate * TRACKING_TIME_S
         bound_s = np.maximum(excess - linear, 0.0) / self._max_rate
-        remaining = np.minimum(excess, linear) * np.exp(np.minimum(bound_s - dt_s, 0.0) / _TRACKING_TIME_S)
+        remaining = np.minimum(excess, linear) * np.exp(np.minimum(bound_s - dt_s, 0.0) / TRACKING_TIME_S)
         remaining = np.maximum(remaining, excess - self._max_rate * dt_s)
         fraction = (1 - remaining / np.maximum(excess, 1e-12)) * free
         if np.count_nonzero(falling := falls & free):
@@ -321,8 +321,8 @@ class Baseline:
         kept = shift @ self._hand_membership * self.held
         self.offset += kept[:, None] * self._used
         settled = (
-            self.drift_speed * _TRACKING_TIME_S + _MAX_RETURN_FRACTION * self._noise - self.std
-        ) * -np.expm1(-dt_s / _TRACKING_TIME_S)
+            self.drift_speed * TRACKING_TIME_S + _MAX_RETURN_FRACTION * self._noise - self.std
+        ) * -np.expm1(-dt_s / TRACKING_TIME_S)
         self.std += np.where(free, settled, self.drift_speed * elapsed_s)
         self._anchored_s += free * dt_s
         if np.count_nonzero(due := self._anchored_s >= _DRIFT_SPEED_PERIOD_S):
@@ -350,7 +350,7 @@ class Baseline:
         """Update gravity slopes from the unexplained rest of offsets and the change of gravity (normalised
         LMS); both are smoothed alike, so a constant offset isn't attributed to gravity."""
         turn = self.gravity - self.smoothed_gravity
-        self.smoothed_gravity += turn * (-np.expm1(-dt_s / _TRACKING_TIME_S) * free)[:, None]
+        self.smoothed_gravity += turn * (-np.expm1(-dt_s / TRACKING_TIME_S) * free)[:, None]
         gain = _GRAVITY_GAIN * free / (np.square(turn).sum(axis=1) + _MIN_TURN_SQUARED)
         moved = (mean * gain[:, None])[:, :, None] * turn[:, None]
         self.gravity_slope += moved

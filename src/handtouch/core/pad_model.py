@@ -395,6 +395,14 @@ class PadModel:
         drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]
         return float(self._laws[pad].current(force_n, drive_v, sheet_ohm, spreading_m, series_ohm))
 
+    def centre_force(self, pad: int, counts: float) -> float:
+        """Return the force of a contact at the centre of a pad by the sum of its channels."""
+        current_a = counts * self.mean_ampere_per_count[pad]
+        spreading_m, series_ohm = (values[pad] for values in self._centre_spreading)
+        drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]
+        estimate = self._laws[pad].force(current_a, drive_v, sheet_ohm, spreading_m, series_ohm)
+        return float(estimate.force_n)
+
 
 def _log_radius(radius: float, std: float) -> tuple[float, float]:
     """Return mean and variance of the logarithm of a contact radius."""

@@ -222,8 +222,14 @@ class SupervisorClient:
             "calibration_state": assessment.calibration_state,
             "calibration_id": calibration_id,
             "calibration_progress": assessment.calibration_progress,
+            "least_begin_threshold_n": self._least_begin_n(pad, assessment),
             "diagnoses": (*excitation_off, *(diagnosis.to_map() for diagnosis in assessment.diagnoses)),
         }
+
+    def _least_begin_n(self, pad: int, assessment: CalibrationAssessment) -> float | None:
+        """Return the force of the least threshold of a pad, None while it isn't known."""
+        counts = assessment.least_begin_counts
+        return None if counts is None else self._pipeline.model.centre_force(pad, counts)
 
     def _update_excitation(self, now_ns: int, touching: NDArray[np.bool_]) -> None:
         """Switch the excitation of fading sheets off, or on again."""

@@ -5,13 +5,16 @@ Public names: `TareJob`. A job of the control endpoint that reads every tick and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.core.baseline import TRACKING_TIME_S
 from handtouch.core.events import BaselineEvent
+from handtouch.core.least_threshold import begin_samples, least_begin_counts, level_scatter
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.stages.shear import SHEAR_CHANNELS
@@ -53,6 +56,8 @@ class TareJob:
             np.float64
         )  # sums are of differences from it, to keep precision
         self._touched = np.zeros(len(names), dtype=np.bool_)
+        self._levels: list[list[int]] = [[] for _ in names]
+        """sums of the channels of each pad's samples"""
         self._shear_sum = np.zeros((len(names), SHEAR_CHANNELS))
         self._shear_saturated = np.zeros((len(names), SHEAR_CHANNELS), dtype=np.bool_)
         pacer.request_full_rate(selected, now_ns)
@@ -67,6 +72,8 @@ class TareJob:
         difference = np.where(new[:, None], tick.counts - self._reference_counts, 0.0)
         self._sum += difference
         self._sum_of_squares += difference**2
+        for pad in np.flatnonzero(new).tolist():
+            self._levels[pad].append(int(tick.counts[pad].sum()))
         # a load since the start, of unknown zeros, is what the user says it is: none
         self._touched |= tick.contacts.touching & tick.state.known
         shear = tick.channel_counts[:, tick.model.channels :]
@@ -104,7 +111,24 @@ class TareJob:
             at_rest = tuple((self._shear_sum[pad] / count).tolist())
         self._pipeline.add_event(BaselineEvent(pad, offsets, spread, at_rest))
         self._on_tared(pad, offsets)
-        return {**result, "tared": True, "reason": "", "offset_counts": mean.tolist()}
+        return {
+            **result,
+            "tared": True,
+            "reason": "",
+            "offset_counts": mean.tolist(),
+            "begin_threshold_n": float(model.begin_threshold_n[pad]),
+            "least_begin_threshold_n": self._least_begin_n(pad, model),
+        }
+
+    def _least_begin_n(self, pad: int, model: PadModel) -> float | None:
+        """Return the least threshold of a pad by its noise now and its drift so far [N]; None for too few
+        samples."""
+        period_ns = self._pipeline.cycle.period_ns
+        count = begin_samples(int(model.begin_debounce_ns[pad]), period_ns)
+        noise = level_scatter(np.array(self._levels[pad], np.float64), count)
+        lag = TRACKING_TIME_S * float(self._tick.baseline.drift_speed[pad])
+        least = least_begin_counts(math.hypot(noise, lag), 1e9 / period_ns)
+        return None if math.isnan(least) else model.centre_force(pad, least)
 
     def _refusal_reason(
         self, pad: int, model: PadModel, mean: NDArray[np.float64], std: NDArray[np.float64]

@@ -122,11 +122,8 @@ class VirtualHand:
             solved = self._solve(contacts, t_s)
             counts[solved.rows] += solved.currents_a * gains[solved.rows]
         for row in self._skin_rows:
-            pad = self.virtual_pads[row]
-            currents, own = pad.skin_currents(np.array([t_s]))[0], len(pad.limits)
-            counts[row, :own] += (
-                currents * pad.counts_per_ampere * pad.drift.gain_ratio(np.array([t_s]))[0, 0]
-            )
+            currents = self.virtual_pads[row].skin_currents(np.array([t_s]))[0]
+            counts[row, : len(currents)] += currents * gains[row, : len(currents)]
         readings = self.quantise(counts)
         for row in special:
             own = self.counts(row, [t_s])[0]

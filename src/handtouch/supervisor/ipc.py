@@ -165,6 +165,8 @@ class CalibrationAssessment(Table):
     """Calibration state of the node at a pad, and the pad's diagnoses.
 
     dead_electrode: index of the electrode without which contacts are to be located, None without one.
+    least_begin_counts: sum of its channels above which contacts may begin, see `core.least_threshold`; None
+    while it isn't known.
     """
 
     kind: Literal["assessment"] = "assessment"
@@ -174,6 +176,7 @@ class CalibrationAssessment(Table):
     calibration_progress: ShortText = ""
     diagnoses: Annotated[tuple[Diagnosis, ...], Field(max_length=MAX_DIAGNOSES)] = ()
     dead_electrode: Annotated[int, Field(ge=0, lt=MAX_CHANNELS)] | None = None
+    least_begin_counts: PositiveFloat | None = None
 
 
 class ManualCalibration(Table):

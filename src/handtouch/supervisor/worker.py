@@ -30,6 +30,7 @@ from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.config import Deployment
+from handtouch.core.least_threshold import LevelScatter, least_begin_counts
 from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
 from handtouch.field.model import FractionModel
 from handtouch.field.network import ElectrodeNetwork
@@ -51,6 +52,7 @@ from handtouch.supervisor.ipc import (
 )
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
+from handtouch.wire.status import PadState
 
 _log = logging.getLogger("handtouch.supervisor")
 _STATUS_PERIOD_NS = 500_000_000
@@ -63,6 +65,8 @@ _MAX_SETTLING_STEP_NS = 1_000_000_000
 _MAX_ZERO_CHANGE_SIGMA = 3.0
 """Greatest change of a channel's zero since it was stored; a greater one is a load."""
 
+_MIN_THRESHOLD_CHANGE = 0.1
+"""Least relative change of a least threshold that is reported."""
 
 _SWITCHED = "electrodes share channels by switch_states: gains aren't learned, the pad isn't diagnosed"
 
@@ -84,6 +88,8 @@ class _PadEntry:
     foreign_source: str = ""
     """origin of its calibration, if taken over from another node"""
     last_assessment: CalibrationAssessment | None = None
+    least_begin_counts: float | None = None
+    """as reported last"""
     stored_zero: tuple[FloatArray, FloatArray] | None = None
     """stored offsets (c,) of the node and their present standard deviations (c,), if any"""
     zero_settling_ns: int = 0
@@ -121,6 +127,8 @@ class SupervisorWorker:
             )
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])
+        touches = [pad.touch or deployment.touch for _, pad in entries]
+        self._level_scatter = LevelScatter([round(1e6 * touch.begin_ms) for touch in touches])
         self._diagnoses: dict[int, list[Diagnosis]] = {}
         self._dead_electrodes: Mapping[int, int] = {}
         self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
@@ -184,6 +192,8 @@ class SupervisorWorker:
             )
             self._store_schedule.reset_pad(pad)
             row.stored_zero, row.zero_settling_ns = None, _ZERO_SETTLING_NS
+            row.least_begin_counts = None
+            self._level_scatter.forget(pad)
             if self._diagnostics is not None:
                 self._diagnostics.set_gains(pad, row.calibrator.gains)
                 self._diagnostics.set_offsets(pad, np.zeros(row.channels))
@@ -254,6 +264,7 @@ class SupervisorWorker:
         self._latest_sync_ns = int(block.sync_ns[-1])
         self._update_zeros(block, elapsed_ns)
         self._update_diagnoses(block)
+        self._update_thresholds(block)
         self._store_schedule.update_block(block)
         for pad in np.flatnonzero(block.contact_id.any(axis=0)).tolist():
             self._learn_from_contacts(pad, block, now, messages)
@@ -382,6 +393,18 @@ class SupervisorWorker:
         if self._diagnostics is not None:
             self._dead_electrodes = self._diagnostics.dead_electrodes()
 
+    def _update_thresholds(self, block: SampleBlock) -> None:
+        """Measure how low contacts may begin; what hardly changes is kept, so that it isn't reported."""
+        usable = block.fresh & (block.pad_state == int(PadState.CLEAR)) & ~np.isnan(block.offset_std)
+        levels = (block.counts - block.offset_counts).sum(axis=2)
+        self._level_scatter.add_block(block.sync_ns, levels, usable, block.contact_id != 0)
+        rate = self._level_scatter.samples_per_s
+        for row, scatter in zip(self._pads, self._level_scatter.counts.tolist(), strict=True):
+            if scatter > 0:
+                now, before = least_begin_counts(scatter, rate), row.least_begin_counts
+                if before is None or abs(now - before) > _MIN_THRESHOLD_CHANGE * before:
+                    row.least_begin_counts = now
+
     def _report_assessment(self, pad: int, messages: list[WorkerMessage]) -> None:
         """Report the assessment of a pad, if it changed."""
         row = self._pads[pad]
@@ -398,6 +421,7 @@ class SupervisorWorker:
             calibration_progress=progress[:MAX_TEXT],
             diagnoses=tuple(map(_shorten, diagnoses[:MAX_DIAGNOSES])),
             dead_electrode=self._dead_electrodes.get(pad),
+            least_begin_counts=row.least_begin_counts,
         )
         if row.calibrator.serial is not None and assessment != row.last_assessment:
             row.last_assessment = assessment

@@ -6,11 +6,14 @@ Public names: `RestStatistics`, `ChannelProblem`, `find_rest_problems`, `PressDe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from handtouch.core.least_threshold import level_scatter
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -30,20 +33,23 @@ _MIN_NOISE_COUNTS = 0.5  # with less noise, a working channel may show a constan
 class RestStatistics:
     """Statistics of an untouched pad's c channels, in the node's order, over `samples` samples.
 
-    Counts (c,): `mean`, `std`; `span`: peak to peak.
+    Counts (c,): `mean`, `std`; `span`: peak to peak. `level_std`: standard deviation of the mean of as many
+    sums of the channels as begin a contact, NaN if unknown.
     """
 
     samples: int
     mean: FloatArray
     std: FloatArray
     span: FloatArray
+    level_std: float = math.nan
 
     @classmethod
-    def from_counts(cls, counts: FloatArray) -> RestStatistics:
-        """Compute the statistics of samples (n, c)."""
+    def from_counts(cls, counts: FloatArray, begin_samples: int = 2) -> RestStatistics:
+        """Compute the statistics of samples (n, c); as many as `begin_samples` begin a contact."""
         if not len(counts):
             return cls(0, *np.zeros((3, counts.shape[1])))
-        return cls(len(counts), counts.mean(axis=0), counts.std(axis=0), np.ptp(counts, axis=0))
+        level_std = level_scatter(counts.sum(axis=1), begin_samples)
+        return cls(len(counts), counts.mean(axis=0), counts.std(axis=0), np.ptp(counts, axis=0), level_std)
 
     def stuck_channels(self, noise_counts: float) -> BoolArray:
         """Return the channels (c,) that are constant though noise is expected."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from handtouch import config
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import NodeStatus
 from handtouch.config.channels import node_channels
+from handtouch.core.least_threshold import begin_samples, least_begin_counts
+from handtouch.core.pad_model import PadModel
 from handtouch.hand import pad_network, pad_surface
 from handtouch.procedures.commission import press_instructions as words
 from handtouch.procedures.commission.channel_bars import render_channel_bars
@@ -103,6 +105,12 @@ class CommissioningProcedure(GuidedProcedure[HandSample]):
             np.array(kind.channel_scale[: len(most)]) / (kind.full_scale_counts or most)
             for kind, most in zip(kinds, self._max_counts, strict=True)
         ]
+        self._period_ns = round(1e6 * deployment.daemon.sync_period_ms)
+        touches = [outcome.pad.touch or deployment.touch for outcome in self.outcomes]
+        self._begin_samples = [
+            begin_samples(round(1e6 * touch.begin_ms), self._period_ns) for touch in touches
+        ]
+        self._model = cache(partial(PadModel, deployment))
         self._detector: PressDetector
         self._share_grid = cache(self._make_share_grid)
 
@@ -130,6 +138,13 @@ class CommissioningProcedure(GuidedProcedure[HandSample]):
     def configured_noise_counts(self, row: int) -> float:
         """Return the configured noise of that node."""
         return self._noise_counts[self.assignment.slot_of(row)]
+
+    def least_begin_threshold_n(self, row: int) -> float | None:
+        """Return the least threshold of a pad by the noise of its node at rest, None if that is unknown."""
+        rest = self.rest_of(row)
+        if rest is None or not rest.level_std > 0:
+            return None
+        return self._model().centre_force(row, least_begin_counts(rest.level_std, 1e9 / self._period_ns))
 
     # Before the first press -------------------------------------------------------------------------------
 
@@ -178,8 +193,8 @@ class CommissioningProcedure(GuidedProcedure[HandSample]):
         counts = np.array([sample.counts for sample in samples], np.float64)
         fresh = np.array([sample.fresh for sample in samples])
         return [
-            RestStatistics.from_counts(counts[fresh[:, slot], slot, :channels])
-            for slot, channels in enumerate(self._channels)
+            RestStatistics.from_counts(counts[fresh[:, slot], slot, :channels], begin)
+            for slot, (channels, begin) in enumerate(zip(self._channels, self._begin_samples, strict=True))
         ]
 
     # One pad ----------------------------------------------------------------------------------------------
