@@ -152,10 +152,16 @@ def _link_motion(hand: config.HandTable, pad: config.Pad, stimulus: Stimulus) ->
     gravity = np.array(hand.gravity)
     if not hand.urdf:
         return LinkMotion((), (), None, stimulus.turns, gravity)
-    robot = urdf.read_urdf(Path(hand.urdf))
+    robot = _read_robot(Path(hand.urdf), Path(hand.urdf).stat().st_mtime_ns)
     base = hand.base_link or robot.default_base(hand.palm_link or robot.root)
     chains = robot.joint_chain(pad.mount.link or pad.link), robot.joint_chain(base)
     return LinkMotion(*chains, stimulus.joint_trajectory(robot), stimulus.turns, gravity)
+
+
+@lru_cache(4)
+def _read_robot(path: Path, changed_ns: int) -> urdf.RobotDescription:  # noqa: ARG001
+    """Return a robot description, which all pads of a hand share."""
+    return urdf.read_urdf(path)
 
 
 def _chain_pose(
