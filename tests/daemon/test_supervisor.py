@@ -20,6 +20,7 @@ from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
+    ContactLawMessage,
     ManualCalibration,
     SampleBlock,
     WorkerMessage,
@@ -399,6 +400,29 @@ def test_learned_behaviour_of_a_sheet_is_restored_and_sent_until_its_node_is_rep
     rig.swap(0, 11, 21)
     rig.step()
     np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), fresh)
+
+
+def test_a_new_sheet_on_the_same_node_sets_aside_what_the_old_one_taught(bench: Any) -> None:
+    """Law, behaviour and parts; the gains are of the node and stay."""
+    rig = modelled(bench)
+    fresh = rig.pipeline.tick.sheet_force.learned_of(0)
+    learned, deployed = fresh.copy(), rig.pipeline.calibrations[0].law
+    learned[1:5] = -3.0
+    law = ContactLawMessage(
+        contact_ohm_mm2=21_000.0, alpha=1.2, ohm_per_square=2000.0, covariance=((0.0,) * 3,) * 3
+    )
+    rig.receive(calibrate(0, 11, back_n=0.2, learned=tuple(learned), law=law))
+    rig.step()
+    assert rig.pipeline.calibrations[0].law != deployed
+    rig.receive(calibrate(0, 11, calibration_id="11-2", new_sheet=True))
+    rig.step()
+    after = rig.pipeline.calibrations[0]
+    assert (after.calibration_id, after.law, after.parts) == ("11-2", deployed, None)
+    assert after.gains == (1.1, 1.0, 1.0, 0.9)
+    np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), fresh)
+    rig.receive(calibrate(0, 11, calibration_id="11-3", law=law))  # the new one's, measured
+    rig.step()
+    assert rig.pipeline.calibrations[0].law.contact_ohm_mm2 == 21_000.0
 
 
 def test_learned_behaviour_that_no_sheet_has_is_refused(bench: Any) -> None:

@@ -82,7 +82,14 @@ def test_derivatives_of_shares_are_those_of_differences() -> None:
 
 def test_other_parts_change_a_film_as_they_change_an_even_sheet() -> None:
     uneven = on_film(lambda s, t: 0.2 * np.cos(np.pi * s) + 0.1 * t)
-    for change in (lambda pad: pad.with_moved_end(3, 2e-4), lambda pad: pad.stretched(1.01)):
+
+    def moved(pad: ElectrodeNetwork) -> ElectrodeNetwork:
+        return pad.with_moved_end(3, 2e-4)
+
+    def longer(pad: ElectrodeNetwork) -> ElectrodeNetwork:
+        return pad.stretched(1.01)
+
+    for change in (moved, longer):
         one, other, scale = change(uneven), change(EVEN), change(EVEN).a / EVEN.a
         at = INSIDE[0] * scale, INSIDE[1]
         np.testing.assert_allclose(

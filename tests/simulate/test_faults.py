@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -32,7 +33,7 @@ from handtouch.simulate.faults import (
 )
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, ElectronicsSpread, Fixed, World
 
 CALM = World("calm", electronics=ElectronicsSpread(noise_ratio=Fixed(0.0))).draw(3)
 FULL_MA = 0.02  # fine enough that rounding doesn't matter
@@ -305,6 +306,34 @@ def test_pad_size_is_that_of_its_surface(deployment: config.Deployment) -> None:
 def test_inconsistent_fault_is_rejected(wrong: object) -> None:
     with pytest.raises(ValidationError):
         wrong()  # type: ignore[operator]
+
+
+def test_a_new_sheet_changes_currents_from_then_on_and_no_node(deployment: config.Deployment) -> None:
+    """Twice the contact resistance halves what it conducts, but for the sheet's own resistance in series."""
+    touch = {"link": "flat", "from_s": 0.0, "duration_s": 20.0, "path": ((0.5, 0.5),), "force_n": (1.0,)}
+    swap = {"link": "flat", "at_s": 10.0, "sheet": 3, "contact_ohm_ratio": 2.0}
+    hands = [
+        VirtualHand(deployment, Scenario.model_validate(tables, strict=False), DrawnWorld(WORLDS["ideal"], 0))
+        for tables in ({"touch": (touch,)}, {"touch": (touch,), "swap": (swap,)})
+    ]
+    old, new = (hand.counts(0, [5.0, 9.99, 10.01, 15.0]).sum(axis=1) for hand in hands)
+    np.testing.assert_array_equal(new[:2], old[:2])
+    assert np.all(new[2:] < 0.75 * old[2:])
+    assert np.all(new[2:] > 0.5 * old[2:])
+    with pytest.raises(ValidationError, match="must have serial"):
+        Scenario.model_validate({"swap": ({"link": "flat", "at_s": 1.0},)}, strict=False)
+
+
+def test_sheets_of_other_numbers_have_other_parts_on_the_same_node(deployment: config.Deployment) -> None:
+    world, (hand, pad) = DrawnWorld(WORLDS["harsh"], 4), deployment.pads[0]
+    first, second, third = (replace(world, sheet_number=number).pad(hand, pad) for number in (0, 1, 2))
+    for one, other in ((first, second), (second, third)):
+        assert (one.gain_ratio, one.series_ohm, one.noise_ratio) == (
+            (other.gain_ratio, other.series_ohm, other.noise_ratio)
+        )
+        assert one.contact_ohm_ratio != other.contact_ohm_ratio
+        assert one.unevenness != other.unevenness
+        assert one.gap_before_mm != other.gap_before_mm
 
 
 def test_shipped_fault_scenario_fits_shipped_hand() -> None:

@@ -26,6 +26,8 @@ from handtouch.calibration.calibration import (
 )
 from handtouch.calibration.store import Store
 from handtouch.calibration.store_client import MountingPoint, StoreClient
+from handtouch.config import NamedPad
+from handtouch.procedures.calibrate.new_sheet import store_new_sheet
 from handtouch.sheet import S1, BankPrior, BankState, ModelBank
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
@@ -183,6 +185,33 @@ def test_version_stored_by_another_process_is_applied_within_seconds(bench: Benc
     (applied,) = calibrations(later(bench, worker, 9.0), 0)
     assert newest.calibration.gains is not None
     assert applied.gains == pytest.approx(newest.calibration.gains.factors)
+
+
+def test_a_new_sheet_stored_by_another_process_is_announced_with_the_gains_of_the_node(
+    bench: Bench, swapped: Swapped
+) -> None:
+    worker = make_worker(bench, swapped[1])
+    worker.process_message(bench.introduce([11, 12, 5]), NOW)
+    later(bench, worker, 3.0)
+    pad = NamedPad("right", bench.deployment.pads[0].pad)
+    with Store(swapped[1]) as store:
+        before = store.newest(11)
+    assert before is not None
+    assert before.calibration.gains is not None
+    made = store_new_sheet(swapped[1], pad, 11, before.config, NOW)
+    with Store(swapped[1]) as store:
+        after = store.newest(11)
+    assert after is not None
+    assert after.calibration == Calibration(
+        Gains(before.calibration.gains.factors, before.calibration.gains.covariance)
+    )
+    (applied,) = calibrations(later(bench, worker, 6.0), 0)
+    assert (applied.calibration_id, applied.new_sheet, applied.parts) == (made, True, None)
+    assert applied.gains == pytest.approx(before.calibration.gains.factors)
+    with Store(swapped[1]) as store:  # for the tests after this one
+        store.roll_back(11, before.number, Provenance(""), NOW)
+    (applied,) = calibrations(later(bench, worker, 9.0), 0)
+    assert not applied.new_sheet
 
 
 def test_manual_gains_end_quarantine_and_are_refined(bench: Bench, session: Session, tmp_path: Path) -> None:

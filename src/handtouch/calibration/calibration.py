@@ -35,6 +35,8 @@ _NODE_TO_NODE_LOG_GAIN_STD = 0.05
 """Standard deviation of a log gain from node to node."""
 _OFFSET_STD_PER_ROOT_HOUR_COUNTS = 3.0
 """Standard deviation of an offset's random walk, after an hour."""
+NEW_SHEET_METHOD = "sheet replaced"
+"""Method of a version that sets aside what was known of a sheet, as its node has another one."""
 MIN_GAIN, MAX_GAIN = 0.1, 10.0
 """Range of gain factors; no amplifier meant for these channels is beyond it."""
 

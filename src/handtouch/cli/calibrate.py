@@ -89,6 +89,12 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         dest="timeout_s",
     )
     guided.add_argument(
+        "--new-sheet",
+        action="store_true",
+        help="the pad has another sheet on the same node: set aside law, state and parts of the old one, "
+        "keep the gains; needs --config, nothing is measured",
+    )
+    guided.add_argument(
         "--live", metavar="ENDPOINT", help="the daemon's live stream (default: as the deployment file says)"
     )
 
@@ -135,6 +141,7 @@ def run(
     offsets: Sequence[float] | None,
     law: Sequence[float] | None,
     hertz_force_n: float | None,
+    new_sheet: bool,
     **options: Any,
 ) -> int:
     """Measure a contact law, set a calibration or print the active one; `options` of `CalibrateOptions`.
@@ -151,6 +158,11 @@ def run(
     with failing(2, ValueError, OSError):
         endpoint = find_endpoint("control", endpoint, config)
         stream = find_endpoint("live", live, config)
+    if new_sheet:
+        if guided or values or name is not None or config is None:
+            raise CommandError("handtouch calibrate: --new-sheet takes --config CONFIG and nothing else", 2)
+        asked = calibrate.CalibrateOptions(pad=pad, config=config, as_json=as_json, **options)
+        return _run_new_sheet(asked, calibrate.DaemonEndpoints(stream, endpoint, key))
     if from_file is not None and not from_file.is_file():
         raise CommandError(f"{from_file}: no such file; --from reads readings that --log recorded", 2)
     if guided and config is not None:
@@ -187,6 +199,19 @@ def _find_conflict(
     if values and name is None:
         return "--name NAME is missing: the id of the new calibration"
     return ""
+
+
+def _run_new_sheet(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
+    with failing(2, ValueError), failing(1, calibrate.CalibrationError, StoreError, OSError, RuntimeError):
+        stored = calibrate.set_new_sheet(options, endpoints, datetime.now(UTC))
+    if options.as_json:
+        print_json({"calibration_id": stored})
+    else:
+        print(
+            f"{options.pad}: stored as {stored}, with the gains of its node only; a daemon that uses this "
+            "store applies it within seconds: law and sheet of the deployment file, learned anew"
+        )
+    return 0
 
 
 def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:

@@ -501,6 +501,7 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     absent = {"shear", "shear_electrodes"} | (set() if pad.arcs_mm else {"electrode_arcs_mm"})
     absent |= set() if pad.switch_states else {"switch_states"}
+    absent |= set() if pad.resistance_map else {"resistance_map"}
     text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
     unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if sheet.hertz_force_n is None else set())
     text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=unstated)

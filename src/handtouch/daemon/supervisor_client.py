@@ -359,12 +359,16 @@ class SupervisorClient:
         elif pad not in self._unconfirmed_calibrations:  # newer knowledge replaces manual settings
             self._manual_parts.pop(pad, None)
         before = pipeline.calibrations[pad]
-        law = before.law if message.law is None else LawParameters(**message.law.model_dump())
+        law = pipeline.model.default_calibration(pad).law if message.new_sheet else before.law
+        if message.law is not None:
+            law = LawParameters(**message.law.model_dump())
         self._log_gain_covariance[pad], self._parts[pad] = None, message.parts
         if message.covariance is not None:
             self._log_gain_covariance[pad] = np.reshape(message.covariance, (len(message.gains), -1))
         calibration = replace(before, calibration_id=message.calibration_id, gains=message.gains, law=law)
         self._set_calibration(pad, calibration, before.quarantined)
+        if message.new_sheet:
+            pipeline.add_event(ReplacementEvent(pad))
         if offsets is not None:
             pipeline.add_event(BaselineEvent(pad, offsets, message.offset_std or (0.0,) * len(offsets)))
         if message.back_n is not None:

@@ -121,6 +121,9 @@ class UnevenNetwork(ElectrodeNetwork):
     of electrodes, or of another length, differ from their even ones by as much.
     """
 
+    _even: ElectrodeNetwork
+    _change: _Change
+
     @classmethod
     def on_film(
         cls, even: ElectrodeNetwork, film: Film, surface: Surface, contact_radius: float
@@ -158,7 +161,8 @@ class UnevenNetwork(ElectrodeNetwork):
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         s, t = np.broadcast_arrays(np.asarray(x) / self.a, np.asarray(y) / self.b)
-        return super().spreading_radius(x, y) * np.exp(self._change.log_radius(s, t, grid=False))
+        ratio = np.exp(self._change.log_radius(s, t, grid=False))
+        return np.asarray(super().spreading_radius(x, y) * ratio)
 
     def _evaluate(self, x: npt.ArrayLike, y: npt.ArrayLike, by_x: int = 0, by_y: int = 0) -> FloatArray:
         """Return the changes of the shares (m, ...), or derivatives by the fractions of the sides."""

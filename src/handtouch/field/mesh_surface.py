@@ -213,7 +213,8 @@ class MeshSurface(Surface):
         return np.stack([first, np.cross(outward / np.linalg.norm(outward, axis=0), first, axis=0)])
 
     def normal(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        return np.cross(*self.tangents(x, y), axis=0)
+        first, second = self.tangents(x, y)
+        return np.cross(first, second, axis=0)
 
     def scales(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         return np.asarray(np.linalg.norm(self._slopes(x, y), axis=1))

@@ -42,14 +42,16 @@ class SimulatedSheetHistory:
         settling_times_s: FloatArray,
         press_begins_s: FloatArray,
         repeat_period_s: float,
+        begin_s: float = 0.0,
     ) -> None:
         self._law, self._noise_key = law, key
         self._total_force_n, self._temperature_rise_k = total_force_n, temperature_rise_k
+        self._begin_s = begin_s
         self._repeat_period_s, self._press_begins_s = repeat_period_s, np.sort(press_begins_s)
         times = np.concatenate([force_times_s, (settling_times_s[:, None] + _SETTLING_KNOTS_S).ravel()])
         self._knots = np.unique(np.ceil(times / _MIN_KNOT_INTERVAL_S) * _MIN_KNOT_INTERVAL_S)
         self._excitation_switches: list[tuple[float, bool]] = []
-        self._checkpoints: list[tuple[float, SheetStates]] = [(0.0, SheetStates(self._law))]
+        self._checkpoints: list[tuple[float, SheetStates]] = [(self._begin_s, SheetStates(self._law))]
         self._segments: list[tuple[FloatArray, FloatArray]] = []  # after each checkpoint: times, ratios
         self._force_ratios: tuple[FloatArray, FloatArray] | None = None
 
@@ -61,7 +63,7 @@ class SimulatedSheetHistory:
         keep = max(int(np.searchsorted([time_s for time_s, _ in self._checkpoints], t_s, side="right")), 1)
         del self._checkpoints[keep:], self._segments[keep - 1 :]
         if t_s < self._checkpoints[0][0]:
-            self._checkpoints, self._segments = [(0.0, SheetStates(self._law))], []
+            self._checkpoints, self._segments = [(self._begin_s, SheetStates(self._law))], []
         self._excitation_switches.append((t_s, on))
         self._force_ratios = None
 
@@ -73,7 +75,7 @@ class SimulatedSheetHistory:
         if len(times_s) == 0:
             return np.ones(0)
         if times_s.min() < self._checkpoints[0][0]:  # before the oldest checkpoint: start again
-            self._checkpoints, self._segments = [(0.0, SheetStates(self._law))], []
+            self._checkpoints, self._segments = [(self._begin_s, SheetStates(self._law))], []
         self._extend_to(float(times_s.max()))
         if self._force_ratios is None:
             whole = (np.concatenate(parts) for parts in zip(*self._segments, strict=True))

@@ -248,7 +248,7 @@ class _SimulatedBus:
         for hand, pad in self._virtual_hand.pads:
             device = self.devices[f"{hand}/{pad.link}"]
             for replacement in stimulus.node_replacements:
-                if replacement.link == pad.link:
+                if replacement.link == pad.link and replacement.serial is not None:
                     yield replacement.at_s, partial(device.replace_device, replacement.serial)
             for fault in stimulus.node_faults:
                 if fault.link == pad.link:

@@ -8,14 +8,14 @@ Public names: `Stimulus` (a whole hand), `PadStimulus` (one pad), `AppliedContac
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from handtouch.config.base import Table
-from handtouch.config.tables import Name, PositivePerChannel, Unsigned32
+from handtouch.config.tables import Name, Positive, PositivePerChannel, Unsigned32
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
@@ -37,15 +37,37 @@ class AppliedContact(NamedTuple):
 
 
 class NodeReplacement(Table):
-    """`[[swap]]`: a pad's node is replaced by one with another serial number."""
+    """`[[swap]]`: a pad's node is replaced by one with another serial number, or its sheet by another one."""
 
-    link: Name = Field(description="link whose pad gets another node")
+    link: Name = Field(description="link whose pad gets another node or sheet")
     at_s: float = Field(ge=0, description="time since the start; happens once, even in a repeating scenario")
-    serial: Unsigned32 = Field(description="serial number of the new node")
+    serial: Unsigned32 | None = Field(
+        None, description="serial number of the new node; left out: the node stays"
+    )
+    sheet: int | None = Field(
+        None,
+        ge=1,
+        le=1_000_000,
+        description="number of the new sheet, by which resistances, law, gaps and behaviour are drawn; its "
+        "state is fresh; left out: the sheet stays",
+    )
+    contact_ohm_ratio: Positive | None = Field(
+        None, description="contact resistance of the new sheet over the old one's; left out: drawn by sheet"
+    )
     gain: PositivePerChannel | None = Field(
         None,
         description="gains of its channels, relative to the configured ones; left out: drawn by serial",
     )
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Self:
+        if self.serial is None and self.sheet is None:
+            raise ValueError("must have serial, of a new node, or sheet, the number of a new one")
+        if self.gain is not None and self.serial is None:
+            raise ValueError("gain: is of a new node, which needs serial")
+        if self.contact_ohm_ratio is not None and self.sheet is None:
+            raise ValueError("contact_ohm_ratio: is of a new sheet, which needs sheet")
+        return self
 
 
 class JointTrajectory(Protocol):

@@ -94,7 +94,7 @@ class VirtualHand:
         self._special_rows = [
             number
             for number, row in enumerate(self.virtual_pads)
-            if row.faults or row.replacement_gains or row.circuit.states
+            if row.faults or row.replacement_gains or row.new_sheets or row.circuit.states
         ]
         self._skin_rows = [number for number, row in enumerate(self.virtual_pads) if row.skin]
         self._touch_pads = [

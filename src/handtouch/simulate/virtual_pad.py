@@ -7,7 +7,7 @@ the same time gives the same counts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,7 +28,7 @@ from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
 from handtouch.simulate.skin import SkinLoad
-from handtouch.simulate.stimulus import PadStimulus, Stimulus
+from handtouch.simulate.stimulus import NodeReplacement, PadStimulus, Stimulus
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
@@ -74,6 +74,10 @@ class VirtualPad:
     """Skin on it that presses by its weight."""
     duration_s: float
     """Duration of one pass of the scenario."""
+    sheet_from_s: float = 0.0
+    """Time at which its sheet was fresh."""
+    new_sheets: tuple[VirtualPad, ...] = ()
+    """The same pad with the sheets that replace this one, in the order of time."""
 
     @classmethod
     def build(
@@ -84,10 +88,19 @@ class VirtualPad:
         stimulus: Stimulus,
         world: DrawnWorld,
         faults: Sequence[Fault],
+        new_sheet: NodeReplacement | None = None,
     ) -> VirtualPad:
-        """Build a pad with the touches, faults and replacements of its link."""
+        """Build a pad with the touches, faults and replacements of its link; `new_sheet`: that which it has
+        from then on."""
+        if new_sheet is not None:
+            assert new_sheet.sheet is not None
+            world = replace(world, sheet_number=new_sheet.sheet)
         node, hidden = deployment.nodes[pad.node], world.pad(hand, pad)
         sheet = world.sheet(hand, pad, deployment.sheets[pad.sheet])
+        if new_sheet is not None and new_sheet.contact_ohm_ratio is not None:
+            first = replace(world, sheet_number=0).sheet(hand, pad, deployment.sheets[pad.sheet])
+            ohm = first.contact_ohm_mm2 * new_sheet.contact_ohm_ratio
+            sheet = sheet.model_copy(update={"contact_ohm_mm2": ohm})
         channels = order_by_electrode(node_channels(node), pad)
         limits = np.array([channel.limits for channel in channels])
         scale = np.array([node.channel_scale[pad.electrodes.index(name)] for name in pad.electrode_names])
@@ -129,10 +142,11 @@ class VirtualPad:
             tuple(
                 (
                     node.at_s,
-                    np.array(node.gain or world.replacement_gain(node.serial)) / np.array(hidden.gain_ratio),
+                    np.array(node.gain or world.replacement_gain(node.serial or 0))
+                    / np.array(hidden.gain_ratio),
                 )
                 for node in sorted(stimulus.node_replacements, key=lambda node: node.at_s)
-                if node.link == pad.link
+                if node.link == pad.link and node.serial is not None
             ),
             ElectronicsDrift(world, [(hand, pad.link)], [pad.electrode_names]),
             ChannelErrors(world, [(hand, pad.link)], [len(pad.electrode_names)], [float(limits[:, 1].min())]),
@@ -141,6 +155,12 @@ class VirtualPad:
             shear,
             SkinLoad.of_pad(deployment, hand, pad, circuit, stimulus, world.mount(hand, pad)),
             stimulus.duration_s,
+            new_sheet.at_s if new_sheet is not None else 0.0,
+            tuple(
+                cls.build(deployment, hand, pad, stimulus, world, faults, swap)
+                for swap in sorted(stimulus.node_replacements, key=lambda swap: swap.at_s)
+                if new_sheet is None and swap.link == pad.link and swap.sheet is not None
+            ),
         )
 
     @cached_property
@@ -156,7 +176,9 @@ class VirtualPad:
     @property
     def has_single_contacts_only(self) -> bool:
         """True without faults, replaced nodes and simultaneous contacts."""
-        return not (self.faults or self.replacement_gains) and self.touches.max_contacts <= 1
+        return (
+            not (self.faults or self.replacement_gains or self.new_sheets) and self.touches.max_contacts <= 1
+        )
 
     def counts(self, times_s: ArrayLike) -> CountArray:
         """Return counts (n, m) of the channels at times (n,) since the start."""
@@ -164,6 +186,10 @@ class VirtualPad:
         counts = self._compute_counts(t, self._other_faults)
         for fault in self._stuck_faults:
             self._apply_stuck_channel(fault, t, counts)
+        for pad in self.new_sheets:
+            later = np.flatnonzero(t >= pad.sheet_from_s)
+            if len(later):
+                counts[later] = pad.counts(t[later])
         return counts
 
     @property
@@ -197,6 +223,7 @@ class VirtualPad:
             np.concatenate([settling, gum, ends]),
             np.concatenate([begins, gum]),
             self.repeat_period_s,
+            self.sheet_from_s,
         )
 
     def prepare(self) -> None:
@@ -230,7 +257,7 @@ class VirtualPad:
         force_ratio, supply_ratio = self.force_ratio(times_s), self.drift.supply_ratio(times_s)
         amperes = self.circuit.currents(scenario_s, self.touches, faults, force_ratio, supply_ratio)
         if self.skin:
-            amperes += self.skin_currents(times_s)
+            amperes += self.skin_currents(times_s) * self.drift.supply_ratio(times_s)[:, None]
         for fault in faults:
             if order := fault.channel_permutation:
                 amperes = np.where(fault.is_active(scenario_s)[:, None], amperes[:, order], amperes)
@@ -257,10 +284,10 @@ class VirtualPad:
         return readings
 
     def skin_currents(self, times_s: FloatArray) -> FloatArray:
-        """Return the currents (n, m) [A] of the skin's weight at times (n,) since the start."""
+        """Return the currents (n, m) [A] of the skin's weight at times (n,) since the start, at nominal supply."""
         if self.skin is None:
             return np.zeros((len(times_s), len(self.limits)))
-        return self.skin.currents(self._scenario_time_s(times_s)) * self.drift.supply_ratio(times_s)[:, None]
+        return self.skin.currents(self._scenario_time_s(times_s))
 
     def _apply_stuck_channel(self, fault: StuckChannel, times_s: FloatArray, counts: CountArray) -> None:
         active = np.flatnonzero(fault.is_active(self._scenario_time_s(times_s)))

@@ -123,7 +123,8 @@ class CalibrationUpdate(Table):
     covariance: (c, c) of the log gains of c channels, row by row; None, as the deployment states. parts: of
     the pad, learned with the gains; None, as the deployment states. If known: offset_counts and their
     standard deviations, per channel; contact law; back_n, back_std_n: back force [N] of its sheet; learned:
-    its behaviour, as `sheet.ModelBank.learned`, or empty.
+    its behaviour, as `sheet.ModelBank.learned`, or empty. new_sheet: the node has another sheet than before,
+    so law, state and evidence of the old one don't hold.
     """
 
     kind: Literal["calibration"] = "calibration"
@@ -139,6 +140,7 @@ class CalibrationUpdate(Table):
     back_n: Annotated[float, Field(ge=0)] | None = None
     back_std_n: Annotated[float, Field(ge=0)] = 0.0
     learned: tuple[float, ...] = ()
+    new_sheet: bool = False
 
     @model_validator(mode="after")
     def _check_channels(self) -> Self:

@@ -17,6 +17,7 @@ import numpy as np
 
 from handtouch.calibration.auto_calibration import AutoCalibrator, CalibrationState
 from handtouch.calibration.calibration import (
+    NEW_SHEET_METHOD,
     CalibrationVersion,
     Gains,
     Provenance,
@@ -378,6 +379,9 @@ class SupervisorWorker:
         if known.offsets:
             found["offset_counts"] = known.offsets.counts
             found["offset_std"] = channel_values(np.sqrt(known.offsets.variance))
+        if version.provenance.method == NEW_SHEET_METHOD:
+            found["new_sheet"] = True
+            self._store_schedule.reset_pad(pad)  # what is due is of the old sheet
         if known.law:
             found["law"] = ContactLawMessage.model_validate(asdict(known.law))
         if sheet := restored_sheet(version, age_s(version, now)):

@@ -1,13 +1,15 @@
 """Calibration of a pad's contact law by known weights: guided procedure, or fit of recorded readings.
 
 Public: `CalibrateOptions`, `DaemonEndpoints`, `CalibrationError`; `run_guided` and `refit_recording`, which
-return a `CalibrationResult`. `procedure` is the dialogue, `daemon_pad` the pad of a running daemon, `fit` the
-law, `report` and `plot` its description, `recording` the file of readings, `store_law` its storage.
+return a `CalibrationResult`; `set_new_sheet`. `procedure` is the dialogue, `daemon_pad` the pad of a running
+daemon, `fit` the law, `report` and `plot` its description, `recording` the file of readings, `store_law` and
+`new_sheet` what is stored.
 """
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,6 +22,7 @@ from handtouch.host.installation import extra_command
 from handtouch.procedures.calibrate import plot, report
 from handtouch.procedures.calibrate.daemon_pad import DaemonEndpoints, ServedPad
 from handtouch.procedures.calibrate.fit import fit_law
+from handtouch.procedures.calibrate.new_sheet import store_new_sheet
 from handtouch.procedures.calibrate.procedure import WeightProcedure
 from handtouch.procedures.calibrate.readings import (
     PadCircuitModel,
@@ -40,6 +43,7 @@ __all__ = [
     "refit_recording",
     "report",
     "run_guided",
+    "set_new_sheet",
 ]
 
 _POSITION_STD_M = 0.5e-3
@@ -126,6 +130,26 @@ def run_guided(
         except KeyboardInterrupt:
             dialogue.print_line("Interrupted; nothing was changed but the zero.")
             raise
+
+
+def set_new_sheet(options: CalibrateOptions, endpoints: DaemonEndpoints, now: datetime) -> str:
+    """Set aside what was learned of a pad's sheet, since its node has another one; return the calibration_id.
+
+    A daemon that uses the store applies it within seconds; one that runs is asked for the node's serial
+    number where the deployment file has none. Raises as `run_guided` does.
+    """
+    job = _CalibrationJob(options)
+    serial, store = job.pad.serial, store_path(job.deployment, options.config.parent)
+    if serial is None:
+        with ServedPad(endpoints, job.hand, job.pad.link) as served:
+            until_s = time.monotonic() + options.timeout_s
+            for _ in served.samples():
+                if served.serial is not None or time.monotonic() > until_s:
+                    break
+            serial, store = served.serial, served.store or store
+    if serial is None:
+        raise CalibrationError(f"{job.name}: its node has no serial number, so nothing of it is stored")
+    return store_new_sheet(store, job.entry, serial, job.default_calibration_id, now)
 
 
 class _CalibrationJob:

@@ -150,6 +150,8 @@ class DrawnWorld:
 
     world: World
     seed: int
+    sheet_number: int = 0
+    """Number of the sheets that replace the first ones."""
     family: Family = field(init=False)
 
     def __post_init__(self) -> None:
@@ -157,8 +159,16 @@ class DrawnWorld:
 
     def pad(self, hand: str, pad: config.Pad) -> HiddenPad:
         """Return the properties of a pad; they depend only on the seed, the names and the pad's own table."""
+        name = f"{hand}/{pad.link}"
+        drawn = self._draw_pad(name, pad)
+        if not self.sheet_number:
+            return drawn
+        other = self._draw_pad(f"{name}/sheet {self.sheet_number}", pad)
+        return replace(drawn, **{part: getattr(other, part) for part in _PARTS_OF_SHEET})
+
+    def _draw_pad(self, link: str, pad: config.Pad) -> HiddenPad:
         parts, mounts, sheets = self.world.parts, self.world.mounts, self.world.sheets
-        electronics, link = self.world.electronics, f"{hand}/{pad.link}"
+        electronics = self.world.electronics
         rng = self._stream(link)
         count = len(pad.electrode_names)
         gain = parts.gain_ratio.sample(rng, count)
@@ -331,6 +341,13 @@ class DrawnWorld:
     def _stream(self, *names: str) -> np.random.Generator:
         """Return the random stream of some quantities of an object, independent of all others."""
         return np.random.default_rng((self.seed, zlib.crc32("/".join(names).encode())))
+
+
+_PARTS_OF_SHEET = (
+    *("gap_before_mm", "gap_after_mm", "sheet_ohm_ratio", "anisotropy_ratio", "unevenness"),
+    *("contact_ohm_ratio", "alpha_offset", "sheet_law"),
+)
+"""Properties of a pad that a new sheet on the same node changes."""
 
 
 def _least_gap_mm(pad: config.Pad) -> float:
