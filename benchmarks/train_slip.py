@@ -25,6 +25,7 @@ from benchmarks.bench_slip import PerceptCollector
 from benchmarks.daemon_settings import InlineProcess, pipeline_of
 from benchmarks.page import ROOT, progress
 from handtouch.config import Deployment, load, shipped
+from handtouch.core.columns import TickResult
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs
 from handtouch.core.stages.evidence import (
@@ -33,7 +34,6 @@ from handtouch.core.stages.evidence import (
     OTHERS_WEIGHT,
     SLIP_FEATURES,
 )
-from handtouch.core.tick import TickResult
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels

@@ -18,7 +18,7 @@ _TYPES = {"<f8": "double", "<i8": "long long", "<u4": "unsigned int", "|u1": "un
 def rows_pxd() -> str:
     """Return the structures of all dtypes of the stages whose name ends with _ROW."""
     structs = {}
-    for stage in STAGES:
+    for stage in ("rows", *STAGES):
         for name, declared in vars(importlib.import_module(f"handtouch.core.stages.{stage}")).items():
             if name.endswith("_ROW") and isinstance(declared, np.dtype):
                 struct = name.title().replace("_", "")

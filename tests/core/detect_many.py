@@ -30,7 +30,7 @@ def main(count: int) -> None:
     model = build_pad_model(parse(TOLERANT_DEPLOYMENT + BEHAVIOUR))
     slab, cycle, tick = Slab(model.size), Cycle(PERIOD_NS, 0.6), TickProcessor(model, PERIOD_NS)
     slab.set_layout(1, (ChannelField(0, 0, 16, signed=False), *STANDARD_LAYOUT[1:]))
-    encoder = ContactEncoder(model, tick, session=7)
+    encoder = ContactEncoder(model, tick.state, tick.columns, tick.sheet_force.modelled, session=7)
     digest, t_ns, node_state = hashlib.sha256(), 10**9, np.zeros(model.size, np.uint8)
     tick.state.synchronous[2] = False
     for number in range(count):

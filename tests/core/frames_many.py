@@ -8,10 +8,10 @@ import sys
 import numpy as np
 
 from handtouch.config import load, shipped
+from handtouch.core.columns import PadColumns, TickResult
 from handtouch.core.stages import frames
 from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.state import TickState
-from handtouch.core.tick import PadColumns, TickResult
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 

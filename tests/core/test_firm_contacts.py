@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
 from handtouch.core.channel_currents import ChannelCurrents
+from handtouch.core.columns import TickResult
 from handtouch.core.pad_model import contact_law, law_of
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.wire import ForceStatus, PadState, PositionStatus

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from handtouch.core.memory import view_rows
-from handtouch.core.stages.frames import CONTACT_FRAMES
 from handtouch.core.stages.groups import ContactGroups
+from handtouch.core.stages.rows import CONTACT_FRAMES
 from handtouch.core.state import TickState
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -67,7 +67,10 @@ def test_a_contact_message_has_the_values_of_its_columns(bench: Any, event: wire
     pipeline = Pipeline(copy.deepcopy(bench.model), 5_000_000, 0.6, DiscardingSink())
     rng, state, columns, pad = np.random.default_rng(1), pipeline.state, pipeline.tick.columns, 1
     pipeline.model.set_calibration(pad, ActiveCalibration("default"))
-    encoder = ContactEncoder(pipeline.model, pipeline.tick, session=1 << 52)
+    tick = pipeline.tick
+    encoder = ContactEncoder(
+        pipeline.model, tick.state, tick.columns, tick.sheet_force.modelled, session=1 << 52
+    )
     for number in range(300):
         if number == 200:
             pipeline.model.set_calibration(

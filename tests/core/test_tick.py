@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from handtouch.core.columns import TickResult
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import Cycle, Slab
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.wire import PadState
 
 PERIOD_NS = 5_000_000

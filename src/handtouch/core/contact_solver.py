@@ -66,7 +66,7 @@ def make_solver(
         _work(3 * n),
         view_memory(currents),
         view_memory(model.weight),
-        PartKnowledge(model),
+        PartKnowledge(model.part_axes, model.part_axis_ends, model.part_offsets, model.touch_errors),
         view_memory(model.gain_covariance),
         view_memory(offset_std_a),
         view_memory(force_requested),

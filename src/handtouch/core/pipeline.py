@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
+from handtouch.core.columns import TickResult
 from handtouch.core.contacts import ContactChanges, ContactDetector, IntArray
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
 from handtouch.core.hand_poses import FloatArray, HandPoses
@@ -22,7 +23,7 @@ from handtouch.core.sheet_force import ForceReference
 from handtouch.core.slab import Cycle, Slab
 from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.state import TickState
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.core.tick_messages import MessageSink, TickMessages
 from handtouch.hand.robot_models import RobotModels
 from handtouch.wire import PadState

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.memory import row_count, view_memory
-from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES
+from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
 from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
 from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
@@ -209,7 +209,7 @@ class TickState:
     palm_status: Annotated[Uint8Array, Stored("u1", _PADS)]
     base_status: Annotated[Uint8Array, Stored("u1", _PADS)]
     palm_values: Annotated[FloatArray, Stored("<f8", _PADS, CONTACT_FRAMES, fill=math.nan)]
-    """see `stages.frames.CONTACT_FRAMES`"""
+    """see `stages.rows.CONTACT_FRAMES`"""
     palm_rotation: Annotated[FloatArray, Stored("<f8", _PADS, 3, 3, fill=math.nan)]
     joint_variance_m2: Annotated[FloatArray, Stored("<f8", _PADS)]
     group_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
@@ -240,7 +240,7 @@ class TickState:
     frame_force_vector: Annotated[FloatArray, Stored("<f8", _PADS, 6, fill=math.nan)]
     """force in the palm's frame, then in the base's"""
     part_frames: Annotated[FloatArray, Stored("<f8", _PADS, np.dtype((PART_FRAMES, 2)), fill=math.nan)]
-    """of two contacts on a pad, see `stages.frames.PART_FRAMES`"""
+    """of two contacts on a pad, see `stages.rows.PART_FRAMES`"""
 
     # messages
     contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.core.columns import TickResult
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import Slab
 from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.stages.publish import ContactEncoder
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.wire import ContactEvent, EndReason, PadState
 
 END_REASONS: dict[PadState, EndReason] = {
@@ -68,7 +69,7 @@ class TickMessages:
         self._tick = tick
         self._session = session
         self._state = tick.state
-        self._contact_encoder = ContactEncoder(model, tick, session)
+        self._contact_encoder = self._make_contact_encoder(model)
         self._end_reason: EndReason = ""  # reason for the end of all contacts, when the daemon stops
         self._encoders = {hand: self._make_encoder(hand, rows) for hand, rows in model.rows_of_hand.items()}
         self._hand_topics = [(hand, f"hand/{hand}", f"raw/{hand}") for hand in model.rows_of_hand]
@@ -96,7 +97,7 @@ class TickMessages:
     def replace_model(self, model: PadModel) -> None:
         """Continue with another model of the same pads."""
         self._model = model
-        self._contact_encoder = ContactEncoder(model, self._tick, self._session)
+        self._contact_encoder = self._make_contact_encoder(model)
 
     def end_all_contacts(self, now_ns: int, sink: MessageSink) -> None:
         """Send the end of every contact, because the daemon stops."""
@@ -153,6 +154,10 @@ class TickMessages:
         """
         rows, layout = slice(0, self._model.size), wire.COLUMNS[wire.HandFrame]
         return {name: array.astype(layout[name].dtype) for name, array in self._frame_sources(rows).items()}
+
+    def _make_contact_encoder(self, model: PadModel) -> ContactEncoder:
+        tick = self._tick
+        return ContactEncoder(model, tick.state, tick.columns, tick.sheet_force.modelled, self._session)
 
     def _make_encoder(self, hand: str, rows: slice) -> HandFrameEncoder:
         links = tuple(self._model.links[rows])

@@ -31,6 +31,7 @@ from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import NodeSpec, node_specs, sync_overflows
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
+from handtouch.core.columns import TickResult
 from handtouch.core.compiled import Compilation
 from handtouch.core.gravity import GravityTracker
 from handtouch.core.pad_model import PadModel
@@ -41,7 +42,6 @@ from handtouch.core.scene import (
     RequestedOutputs,
     SceneRequirements,
 )
-from handtouch.core.tick import TickResult
 from handtouch.daemon import stage_timer
 from handtouch.daemon.authentication import Authenticator
 from handtouch.daemon.busy_poll import BusyPoll

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
+from handtouch.core.columns import TickResult
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
-from handtouch.core.tick import TickResult
 from handtouch.core.tick_messages import MessageSink
 from handtouch.daemon.child_process import ChildProcess
 from handtouch.daemon.percept_client import PerceptClient

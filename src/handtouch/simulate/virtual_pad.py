@@ -284,7 +284,7 @@ class VirtualPad:
         return readings
 
     def skin_currents(self, times_s: FloatArray) -> FloatArray:
-        """Return the currents (n, m) [A] of the skin's weight at times (n,) since the start, at nominal supply."""
+        """Return the currents (n, m) [A] of the skin's weight at times (n,), at nominal supply."""
         if self.skin is None:
             return np.zeros((len(times_s), len(self.limits)))
         return self.skin.currents(self._scenario_time_s(times_s))

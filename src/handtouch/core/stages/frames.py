@@ -1,7 +1,6 @@
 """Contacts in the palm and base frames, from the joint states at their sample times; where requested.
 
-Public names: `ContactTransforms`, `FRAME_ROW`, `CONTACT_FRAMES`, `PART_FRAMES`. Free of I/O and clocks; joint
-states come from `joints_at`.
+Public name: `ContactTransforms`. Free of I/O and clocks; joint states come from `joints_at`.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import numpy as np
 from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
 from handtouch.core.stages import kinematics
 from handtouch.core.stages.groups import ContactGroups
+from handtouch.core.stages.rows import CONTACT_FRAMES, FRAME_ROW, PART_FRAMES
 from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
 from handtouch.hand.joints import JointSnapshot
 from handtouch.wire.status import FrameStatus
@@ -22,19 +22,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from handtouch.core.columns import TickResult
     from handtouch.core.contacts import BoolArray, IntArray
     from handtouch.core.state import TickState
-    from handtouch.core.tick import TickResult
     from handtouch.hand.robot_models import RobotModels
 
     FloatArray = NDArray[np.float64]
 
-FRAME_ROW = np.dtype([("position_m", "<f8", 3), ("normal", "<f8", 3), ("covariance_m2", "<f8", 9)])
-"""A contact in one frame"""
-PART_FRAMES = np.dtype([("palm", FRAME_ROW), ("base", FRAME_ROW)])
-"""One of two contacts on a pad"""
-CONTACT_FRAMES = np.dtype([("palm", FRAME_ROW), ("base", FRAME_ROW), ("joints_age_s", "<f8")])
-"""A contact, and the age of the joints that it was transformed by"""
 _PLACES = slices_of(CONTACT_FRAMES)
 _BASE, _AGE = _PLACES["base_position_m"].start, _PLACES["joints_age_s"].start
 _ROW, _PARTS = row_count(CONTACT_FRAMES), 2 * row_count(PART_FRAMES)

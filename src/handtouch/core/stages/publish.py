@@ -1,7 +1,7 @@
 """Output of a tick's contacts: columns with statuses, NaN where there is no value, and contact messages as
 msgpack, whose bytes are those of the codec of `handtouch.wire`.
 
-Public names: `ContactColumns`, `ContactEncoder`, `published_columns`.
+Public names: `ContactColumns`, `ContactEncoder`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import msgpack
 import numpy as np
 
 from handtouch import wire
+from handtouch.core.columns import PUBLISHED, PadColumns
 from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.force import BOUNDED, WIDE
-from handtouch.core.stages.frames import CONTACT_FRAMES, PART_FRAMES
+from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
 from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
 from handtouch.wire import ContactEvent, EndReason
 from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from handtouch.core.pad_model import PadModel
     from handtouch.core.state import TickState
-    from handtouch.core.tick import PadColumns, TickProcessor
 
 COLUMN_ROW = np.dtype(
     [
@@ -69,13 +69,6 @@ _END = 2  # number of the event
 _HEADER_BYTES, _NUMBER_BYTES = 3, 9
 _MAX_SILENT_PERIODS = MAX_SILENT_PERIODS
 _SECONDS_PER_NS = 1e-9
-_PUBLISHED = {
-    name: at
-    for name, at in _PLACES_OF_VALUES.items()
-    if name in wire.COLUMNS[wire.HandFrame] and wire.COLUMNS[wire.HandFrame][name].codes is None
-}
-"""Values of a contact that are columns of hand frames"""
-
 FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "whole", "text", "parts"
 """How a field is written: four kinds from one of INTEGERS; from the memory of the state; as that, plus the
 covariance of the mount; as a whole number of it; as a text of the pad; as the two contacts of a pad."""
@@ -140,16 +133,6 @@ _PART_STEPS = {"parts": row_count(PART_ROW), "part_frames": row_count(PART_FRAME
 _MAX_VALUE_BYTES = 4096  # numbers and names of statuses
 
 
-def published_columns(pads: int) -> tuple[NDArray[np.float32], dict[str, NDArray[np.float32]]]:
-    """Return the memory of the published columns of n pads, and the columns in it, (n, ...)."""
-    widths = {name: at.stop - at.start for name, at in _PUBLISHED.items()}
-    memory, first, columns = np.full(pads * sum(widths.values()), np.nan, np.float32), 0, {}
-    for name, width in widths.items():
-        columns[name] = memory[first : first + pads * width].reshape((pads, width)[:width])
-        first += pads * width
-    return memory, columns
-
-
 class ContactColumns:
     """Columns of n pads: statuses and published values of contacts, of the state's last solved ones."""
 
@@ -202,7 +185,7 @@ class ContactColumns:
 def _column_rows() -> RowArray:
     """Return the published values as COLUMN_ROWs."""
     mount, rows, before = _PLACES_OF_VALUES["mount_covariance_m2"].start, list[tuple[int, ...]](), 0
-    for name, at in _PUBLISHED.items():
+    for name, at in PUBLISHED.items():
         width = at.stop - at.start
         for k in range(width):
             rows.append((before, width, at.start + k, mount + k if name == "covariance_m2" else -1))
@@ -275,6 +258,8 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
 class ContactEncoder:
     """Encoder of the contact messages of a model's pads from the arrays of a tick; `session` is the daemon's.
 
+    has_sheet_model: (n,) pads whose sheet has a model.
+
     fields: FIELD_ROWs, `field_count` of a contact, then those of one of two contacts on a pad. state: memory
     of all arrays as numbers, state_bits as integers of their bits. texts: packed keys of the fields, then
     names; text_ends: where each begins, and the last ends. pad_texts, pad_text_ends: the same of packed
@@ -282,8 +267,14 @@ class ContactEncoder:
     and conditions: working memory.
     """
 
-    def __init__(self, model: PadModel, tick: TickProcessor, session: int) -> None:
-        state = tick.state
+    def __init__(
+        self,
+        model: PadModel,
+        state: TickState,
+        columns: PadColumns,
+        has_sheet_model: NDArray[np.bool_],
+        session: int,
+    ) -> None:
         memory = state.memory
         self.model, self.pack = model, msgpack.Packer().pack
         pack = self.pack
@@ -313,9 +304,9 @@ class ContactEncoder:
         self.contacts, self.parts = view_rows(state.values, VALUE_ROW), view_rows(state.parts, PART_ROW)
         frames = view_rows(state.part_frames, PART_FRAMES)
         self.parts_palm, self.parts_base = frames["palm"], frames["base"]
-        self.position_status = view_memory(tick.columns.position_status)
-        self.force_status = view_memory(tick.columns.force_status)
-        self.has_sheet_model = view_memory(tick.sheet_force.modelled)
+        self.position_status = view_memory(columns.position_status)
+        self.force_status = view_memory(columns.force_status)
+        self.has_sheet_model = view_memory(has_sheet_model)
         self.contact_seq, self.contact_id = memory["contact_seq"], memory["contact_id"]
         self.sample_ns, self.begin_ns = memory["sample_ns"], memory["begin_ns"]
         self.group_id = memory["group_id"]

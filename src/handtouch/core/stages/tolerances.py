@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from handtouch import config
-    from handtouch.core.pad_model import PadModel
     from handtouch.field.network import ElectrodeNetwork
     from handtouch.field.surface import Surface
 
@@ -120,11 +119,16 @@ class PartKnowledge:
     (pads,) standard deviation of the fractions of a touch, another one each time.
     """
 
-    def __init__(self, model: PadModel) -> None:
-        self.axes, self.ends = view_memory(model.part_axes), view_memory(model.part_axis_ends)
-        self.offsets, self.touch_errors = view_memory(model.part_offsets), view_memory(model.touch_errors)
-        self.size, self.rows = model.part_axes.shape[1], model.part_axis_ends.shape[1]
-        self.parts = model.part_offsets.shape[1]
+    def __init__(
+        self,
+        axes: FloatArray,
+        ends: NDArray[np.intp],
+        offsets: FloatArray,
+        touch_errors: FloatArray,
+    ) -> None:
+        self.axes, self.ends = view_memory(axes), view_memory(ends)
+        self.offsets, self.touch_errors = view_memory(offsets), view_memory(touch_errors)
+        self.size, self.rows, self.parts = axes.shape[1], ends.shape[1], offsets.shape[1]
 
 
 class Whitening:
