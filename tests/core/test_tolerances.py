@@ -168,6 +168,43 @@ def test_two_contacts_along_a_side_are_no_point_and_their_covariance_includes_th
     assert (np.sqrt(longest) > 0.8 * apart / 2 * side_x).all()
 
 
+def shares_in_their_regions(model: PadModel, network: ElectrodeNetwork) -> tuple[FloatArray, FloatArray]:
+    """Return shares in the 95 % regions of contacts on a pad with this network, alone and after ten others,
+    and the mean misfits of these ten."""
+    rng, values = np.random.default_rng(7), np.full((3, VALUE_COUNT), np.nan)
+    currents, misfits = np.zeros((3, 4)), np.zeros((3, 3))
+    solver = make_solver(
+        *(model, currents, np.zeros(3), np.ones(3, np.bool_), values), misfits=misfits
+    )  # fmt: skip
+    (a, b), inside, means = sides([network])[0], [], []
+    for _ in range(30):
+        misfits[:] = 0.0
+        alone = []
+        for _contact in range(14):
+            x, y = rng.uniform(0.1, 0.9, 2) * (a, b)
+            currents[0], values[:] = 2e-3 * network.fractions(x, y), np.nan
+            solver.solve_contacts(np.zeros(1, np.intp).data)
+            error = values[0, VALUE_SLICES["xy"]] - (x, y)
+            variance = np.trace(values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)) / 2
+            # of a plane, whose rectangle is in metres
+            alone.append(error @ error < chi2.ppf(0.95, 2) * variance)
+        inside.append([alone[0], *alone[-3:]])
+        means.append(misfits[0, 0])
+    share = np.array(inside)
+    return np.array([share[:, 0].mean(), share[:, 1:].mean()]), np.array(means)
+
+
+def test_misfits_of_earlier_contacts_widen_the_regions_of_a_pad_that_is_not_as_stated() -> None:
+    stated = parse(deployment_text(pad_text("plane", 1), *(pad_text(f"other{k}", k) for k in (2, 3))))
+    model = build_pad_model(stated)
+    with_leads = model.networks[0].with_series_ohm([10.0, 0.0, 5.0, 20.0])
+    alone, after = shares_in_their_regions(model, with_leads)[0]
+    assert alone < 0.65
+    assert after > 0.75
+    means = shares_in_their_regions(model, model.networks[0])[1]
+    assert means.max() < 0.5
+
+
 def test_size_of_a_pad_makes_positions_uncertain_in_proportion_to_the_distance_from_its_middle() -> None:
     exact = parse(DEPLOYMENT)
     sheets = {"s": exact.sheets["s"].model_copy(update={"size_std_mm": 0.5})}

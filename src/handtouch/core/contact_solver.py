@@ -16,6 +16,7 @@ from handtouch.core.stages.force import stack_table
 from handtouch.core.stages.locate import Fit
 from handtouch.core.stages.pairs import PairFit, grid_points, work_size
 from handtouch.core.stages.solve import (
+    MISFIT_COUNT,
     PART_COUNT,
     PART_SLICES,
     PARTS_COUNT,
@@ -38,13 +39,15 @@ def make_solver(
     parts: FloatArray | None = None,
     saturated: NDArray[np.bool_] | None = None,
     noise_squared: FloatArray | None = None,
+    misfits: FloatArray | None = None,
 ) -> ContactSolver:
     """Return a solver of contacts that reads and writes these arrays in place.
 
     currents: (pads, channels) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
     force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
     parts: (pads, PARTS_COUNT), twice PART_SLICES. saturated: (pads, channels), lower bounds of currents.
-    noise_squared: (pads, channels), variances of the channels as measured [counts^2].
+    noise_squared: (pads, channels), variances of the channels as measured [counts^2]. misfits: (pads, 3), see
+    `ContactSolver`.
     """
     n, points = currents.shape[1], grid_points(SEARCH_POINTS)
     limits, moments = model.pair_settings()
@@ -52,6 +55,8 @@ def make_solver(
         parts = np.full((model.size, PARTS_COUNT), np.nan)
     if noise_squared is None:
         noise_squared = np.zeros(currents.shape)
+    if misfits is None:
+        misfits = np.zeros((model.size, MISFIT_COUNT))
     if saturated is None:
         saturated = np.zeros(currents.shape, dtype=np.bool_)
     return ContactSolver(
@@ -75,6 +80,7 @@ def make_solver(
         *(view_memory(limits), view_memory(moments), view_memory(parts)),
         *(view_memory(saturated), view_memory(model.peak_currents_a), view_memory(model.mounts)),
         *(view_memory(model.crowding), view_memory(model.ampere_per_count), view_memory(noise_squared)),
+        view_memory(misfits),
     )
 
 

@@ -22,7 +22,7 @@ from handtouch.core.memory import row_count, view_memory
 from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
 from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.core.stages.slip import SLIP_COUNT
-from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
+from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
@@ -113,6 +113,8 @@ class TickState:
     """values of the contact's last solved sample, see `stages.solve.VALUE_ROW`"""
     parts: Annotated[FloatArray, Stored("<f8", _PADS, np.dtype((PART_ROW, 2)), fill=math.nan)]
     """of each pad the two contacts of that sample, see `stages.solve.PART_ROW`; NaN if there is one"""
+    misfits: Annotated[FloatArray, Stored("<f8", _PADS, MISFIT_COUNT)]
+    """squared misfits of the pad's contacts, see `ContactSolver`"""
     uncompensated_force_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
     uncompensated_std_n: Annotated[FloatArray, Stored("<f8", _PADS, fill=math.nan)]
 

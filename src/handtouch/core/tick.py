@@ -105,6 +105,7 @@ class TickProcessor:
         if calibration.law != self.model.calibrations[pad].law:
             self.sheet_force.reset_evidence(pad)
         self.model.set_calibration(pad, calibration)
+        self.state.misfits[pad] = 0.0
         self.refresh()
         self.discard_solutions(np.array([pad]))
         self.state.peak_force_n[pad] = np.nan
@@ -112,6 +113,7 @@ class TickProcessor:
     def reset_pad(self, pad: int) -> None:
         """Forget what was learned of a pad: its node and sheet were replaced."""
         self.baseline.reset_pad(pad)
+        self.state.misfits[pad] = 0.0
         self.sheet_force.reset_evidence(pad, new_sheet=True)
         self.shear.forget_rest([pad])
         self.discard_solutions(np.array([pad]))
@@ -125,6 +127,7 @@ class TickProcessor:
         self.sheet_force = self.sheet_force.with_behaviours(self.model.behaviours, model.behaviours)
         for pad in changed.tolist():
             self.sheet_force.reset_evidence(pad)
+        self.state.misfits[changed] = 0.0
         moved = changed_shear_pads(self.model.shear_pads, model.shear_pads)
         self.model = model
         self._set_stages(model)
@@ -160,7 +163,7 @@ class TickProcessor:
                 self._estimate_force,
                 columns.values,
             ),
-            *(self.state.parts, self.contacts.saturated, self.state.noise_squared),
+            *(self.state.parts, self.contacts.saturated, self.state.noise_squared, self.state.misfits),
         )
         self.output = ContactColumns(model, self.state, columns)
         statuses = columns.position_status, columns.force_status

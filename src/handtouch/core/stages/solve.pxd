@@ -4,8 +4,8 @@ from handtouch.core.stages cimport force, locate, pairs, tables, tolerances
 
 cdef Py_ssize_t _X, _U, _RESIDUAL, _POSITION, _NORMAL, _FORCE, _FORCE_STD, _RESIDUAL_STD
 cdef Py_ssize_t _COVARIANCE, _MOUNT, _PAD_NOISE, _FORCE_STATUS, _CELLS, _MISFIT, _IS_BOUND, _COUNT, _UNKNOWNS
-cdef Py_ssize_t _MOUNT_COUNT
-cdef double _MIN_PEAK, _UNIFORM_VARIANCE
+cdef Py_ssize_t _MOUNT_COUNT, _MISFIT_COUNT
+cdef double _MIN_PEAK, _UNIFORM_VARIANCE, _MISFIT_CONTACTS, _MIN_LASTING_MISFIT
 cdef Py_ssize_t _PART_POSITION, _PART_NORMAL, _PART_COVARIANCE, _PART_FORCE, _PART_FORCE_STD, _PART_ID, _PART_PLACE, _PART_NEWEST
 cdef Py_ssize_t _PART_COUNT, _PARTS_COUNT
 cdef double _TWO_PI, _INFINITY
@@ -28,7 +28,7 @@ cdef class ContactSolver:
     cdef bint were_two
     cdef double[::1] currents, weight, gain_covariance, offset_std, values
     cdef unsigned char[::1] force_requested, saturated, crowding
-    cdef double[::1] peak_currents, mounts, ampere_per_count, noise_squared
+    cdef double[::1] peak_currents, mounts, ampere_per_count, noise_squared, misfits
     @cython.locals(k=Py_ssize_t)
     cpdef solve_contacts(self, Py_ssize_t[::1] pads)
 
@@ -63,6 +63,10 @@ cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t 
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, i=Py_ssize_t, fit=locate.Fit, table=locate.ModelTable,
                values='double[::1]')
 cdef void _propagate(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(fit=locate.Fit, spread=double, at=Py_ssize_t)
+cdef void _widen_by_misfit(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(at=Py_ssize_t, misfits='double[::1]')
+cdef void _count_misfit(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(n=Py_ssize_t, row=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t, values='double[::1]', noise=double,
                scale=double, measured2=double)
 cdef void _write_pad_noise(ContactSolver solver, Py_ssize_t pad) noexcept

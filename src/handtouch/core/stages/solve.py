@@ -1,7 +1,7 @@
 """Contacts of a tick: locate, estimate the force, place; one row of `values` a pad.
 
 Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFIT`, `PART_COUNT`,
-`PART_SLICES`, `PARTS_COUNT`, `MOUNT_COUNT`.
+`PART_SLICES`, `PARTS_COUNT`, `MOUNT_COUNT`, `MISFIT_COUNT`.
 """
 
 from __future__ import annotations
@@ -82,6 +82,12 @@ _PART_MOTION = 2.0  # of one of two contacts that moves, in motions of the singl
 _PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 _UNKNOWNS = 3  # of a contact: position and total
 _MIN_PEAK = 1.2  # largest current of a contact, relative to the reading of a saturated channel
+_MISFIT_COUNT = 3
+MISFIT_COUNT = _MISFIT_COUNT
+"""Values of a pad's misfits."""
+_MISFIT_CONTACTS, _MIN_LASTING_MISFIT = 8.0, 2.0
+"""Contacts over which the misfit of a pad's contacts is averaged; mean that widens the covariance of later
+ones: 5 % of pads as stated have more, by contacts of seven shapes (`default`, tuning family)."""
 _UNIFORM_VARIANCE = 1.0 / 12.0  # of a value anywhere in a range, in squares of the range
 
 
@@ -101,7 +107,9 @@ class ContactSolver:
     electrode by the firmest contact [A]. mounts: (pads MOUNT_COUNT,) origin of each pad on its link [m], and
     the variances of that along each axis [m^2] and about it [rad^2]. crowding: (pads,), 1 where currents
     crowd towards electrodes. ampere_per_count, noise_squared: (pads c,), variances of the channels [counts^2]
-    as measured; where the stated noise is larger, that counts.
+    as measured; where the stated noise is larger, that counts. misfits: (3 pads,), running mean of the
+    squared misfits of a pad's contacts; of the last contact those of its samples, each times the square of
+    its current, summed, and the sum of these squares.
     """
 
     def __init__(
@@ -132,7 +140,9 @@ class ContactSolver:
         crowding: memoryview[int],
         ampere_per_count: memoryview[float],
         noise_squared: memoryview[float],
+        misfits: memoryview[float],
     ) -> None:
+        self.misfits = misfits
         self.ampere_per_count, self.noise_squared = ampere_per_count, noise_squared
         self.mounts, self.crowding = mounts, crowding
         self.saturated, self.peak_currents = saturated, peak_currents
@@ -177,6 +187,8 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
             saturated += 1
     if saturated:
         _estimate_saturated(solver, pad)
+    if values[row + _CELLS] != values[row + _CELLS]:  # a new contact
+        _count_misfit(solver, pad)
     locate.locate(
         table,
         fit,
@@ -435,11 +447,31 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
     fit.cost *= table.misfit_scale
     values[row + _MISFIT] = fit.cost
     _write_pad_noise(solver, pad)
-    excess = fit.cost - _MAX_SQUARED_MISFIT
-    if excess > 0.0:
-        fit.var_x *= 1.0 + excess
-        fit.var_y *= 1.0 + excess
-        fit.cov_xy *= 1.0 + excess
+    _widen_by_misfit(solver, pad)
+
+
+def _widen_by_misfit(solver: ContactSolver, pad: int) -> None:
+    """Widen the covariance by this contact's misfit, or by those of the pad's last contacts, which show that
+    its parts aren't as stated. Where two contacts are told apart, misfits are no evidence of that."""
+    fit, spread, at = solver.fit, 1.0, _MISFIT_COUNT * pad
+    if solver.misfits[at] > _MIN_LASTING_MISFIT:
+        spread = solver.misfits[at]
+    spread = max(spread, 1.0 + fit.cost - _MAX_SQUARED_MISFIT)
+    if spread > 1.0:
+        fit.var_x *= spread
+        fit.var_y *= spread
+        fit.cov_xy *= spread
+    if not solver.pair_limits[pad] < _INFINITY:
+        solver.misfits[at + 1] += fit.total * fit.total * min(fit.cost, _MAX_SQUARED_MISFIT)
+        solver.misfits[at + 2] += fit.total * fit.total
+
+
+def _count_misfit(solver: ContactSolver, pad: int) -> None:
+    """Add the misfit of a pad's contact before to the running mean of its contacts."""
+    at, misfits = _MISFIT_COUNT * pad, solver.misfits
+    if misfits[at + 2] > 0.0:
+        misfits[at] += (misfits[at + 1] / misfits[at + 2] - misfits[at]) / _MISFIT_CONTACTS
+        misfits[at + 1] = misfits[at + 2] = 0.0
 
 
 def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> None:
