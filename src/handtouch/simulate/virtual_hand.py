@@ -183,8 +183,10 @@ class VirtualHand:
 
         It is on from the start.
         """
-        if history := self.virtual_pads[pad_row].history:
-            history.switch_excitation(t_s, on)
+        row = self.virtual_pads[pad_row]
+        for pad in (row, *row.new_sheets):
+            if history := pad.history:
+                history.switch_excitation(t_s, on)
 
     def truth(self, t_s: float, sync_ns: int = 0) -> list[GroundTruth]:
         """Return the true contacts of the sample at `t_s`; `sync_ns` is its SYNC on the host's clock."""
