@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,17 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from handtouch import cli, client, config
-from handtouch.calibration.calibration import CalibrationVersion
+from handtouch.calibration.calibration import (
+    NEW_SHEET_METHOD,
+    Calibration,
+    CalibrationVersion,
+    Gains,
+    LawParameters,
+    Offsets,
+    Provenance,
+    StoredSheetState,
+    matrix,
+)
 from handtouch.calibration.store import Store
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import default_calibration_id_of, law_of
@@ -485,6 +496,28 @@ def test_recording_is_fitted_again_plotted_and_stored(
     assert answer["law"]["alpha"] == version.calibration.law.alpha
     assert answer["intervals_95"]["alpha"][0] < TRUE["alpha"] < answer["intervals_95"]["alpha"][1]
     assert answer["force_error_after"] < 0.1
+
+
+def test_a_new_sheet_keeps_the_gains_of_its_node_and_nothing_of_the_old_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, _ = written(tmp_path, [])
+    deployment = config.load(file)
+    nominal = default_calibration_id_of(deployment.hands[0].pads[0], deployment)
+    gains = Gains((1.1, 1.0, 1.0, 0.9), matrix(1e-6 * np.eye(4)))
+    law = LawParameters(21_000.0, 1.4, 2400.0, matrix(np.diag([1e-4, 1e-4, 1e-6])))
+    old = Calibration(gains, Offsets((1.0,) * 4, (0.1,) * 4), law, StoredSheetState("S1", 1, b"state"))
+    with Store(tmp_path / "store.db") as store:
+        store.write(4711, nominal, old, Provenance("guided session"), datetime.now(UTC))
+    assert cli.main(["calibrate", "plane", "--new-sheet", "--config", str(file)]) == 0
+    assert "4711-2" in capsys.readouterr().out
+    with Store(tmp_path / "store.db") as store:
+        version = store.newest(4711)
+    assert version is not None
+    assert version.calibration == Calibration(gains)
+    assert version.provenance.method == NEW_SHEET_METHOD
+    assert cli.main(["calibrate", "plane", "--new-sheet"]) == 2
+    assert cli.main(["calibrate", "plane", "--new-sheet", "--config", str(file), "--weights", "20"]) == 2
 
 
 def test_a_law_of_a_growing_radius_is_stored_and_applied(
