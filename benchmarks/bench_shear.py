@@ -264,7 +264,7 @@ def main() -> None:
     touches = 20 if quick else 400  # drawn pads of each row
     report = Report(quick, touches_of_a_row=touches)
     worlds, by_force = world_rows(touches)
-    fingers, of_pad = (1, 3) if quick else (16, 12)
+    fingers, of_pad = (1, 3) if quick else (8, 16)
     report.table("Through the daemon's pipeline", served_rows(fingers, of_pad))
     report.table("By world and pattern", worlds)
     report.table("By size of the force", by_force)

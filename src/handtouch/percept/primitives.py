@@ -320,10 +320,10 @@ class _PrimitiveProblem:
                 new[-1] = min(
                     max(new[-1], math.log(_MIN_START_RADIUS_M) - 2), math.log(_MAX_START_RADIUS_M) + 3
                 )
-            cost, *found = self.cost(frame, new + steps)
+            cost, new_r, new_errors = self.cost(frame, new + steps)
             gained = best - cost
             if gained > 0:
-                theta, best, (r, errors), damping = new, cost, found, damping * 0.1
+                theta, best, r, errors, damping = new, cost, new_r, new_errors, damping * 0.1
             else:
                 damping *= 10
             if abs(gained) < _COST_TOLERANCE:
