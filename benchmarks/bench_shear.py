@@ -9,8 +9,9 @@ of the force: crossed bars.
 *Through the daemon's pipeline*: fingers of [shear.toml](../../config/shear.toml), neither tared nor
 calibrated, with drawn parts, sheets and mounts, of which only spreads are stated. Touches of 0.2 to 12 N
 anywhere on a pad, pulled by up to 0.6 of that, follow each other as in [worlds](worlds.md), 16 of them before
-those that are scored. *Published*: vectors with a covariance, whatever the status; the tangential part is
-scored along the pad's axes as stated. Intervals of coverage are of touches; those of a finger share its pads.
+those that are scored. The tangential part is scored along the pad's axes as stated, where it has a
+covariance: a vector whose normal force is a lower bound has none. Intervals are of touches; those of a finger
+share its pads.
 """
 
 from __future__ import annotations
@@ -252,9 +253,12 @@ def served_rows(fingers: int, touches: int) -> list[Row]:
         for head in ("pattern", "normal force"):
             for label, some in slices(every, head):
                 score = EstimateScore.of_estimates(some).row(bounds=False)
-                share = {"published, %": score.pop("valid, %")}
-                status = {"`valid`, %": Share.of_mask(some.columns["status"] == "valid")}
-                rows.append({"world": world, "touches of": label, **score, **share, **status})
+                scored = {"with covariance, %": score.pop("valid, %")}
+                statuses = {
+                    f"`{status}`, %": Share.of_mask(some.columns["status"] == status)
+                    for status in ("valid", "unreliable", "lower_bound", "invalid")
+                }
+                rows.append({"world": world, "touches of": label, **score, **scored, **statuses})
         progress(f"pipeline, {world}")
     return rows
 
