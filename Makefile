@@ -48,7 +48,7 @@ $(VENV)/.dev: pyproject.toml locks/dev.lock locks/build.lock | $(BIN)/python
 	@touch $(VENV)/.run $(VENV)/.view $@
 
 # sources that Cython compiles; a run without a compiler is slower, and says so
-CORE := $(wildcard src/handtouch/core/stages/*.py src/handtouch/core/stages/*.pxd) src/handtouch/core/compiled.py
+CORE := $(wildcard src/handtouch/*/stages/*.py src/handtouch/*/stages/*.pxd) src/handtouch/core/compiled.py
 $(VENV)/.core: $(CORE) | $(VENV)/.dev
 	@$(BIN)/python src/handtouch/core/build.py && touch $@ || test "$(CI)" != true
 
