@@ -428,6 +428,36 @@ def test_errors_of_shear_pads_name_location_value_and_remedy(change: tuple[str, 
     assert expected in config_error(text.replace(*change, 1))
 
 
+OBJECT_ERRORS = {
+    'object = "bolts"': '1 "right": object = "bolts": there is no [object.bolts]; did you mean "bolt"?',
+    "head_diameter_mm = 10.0": "[object.bolt]: shape.head_diameter_mm = 10: must be more than diameter_mm",
+    "length_mm = -4.0": "[object.bolt.shape]: length_mm = -4.0: must be",
+    'kind = "cone"': "[object.bolt]: shape",
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), OBJECT_ERRORS.items(), ids=OBJECT_ERRORS.keys())
+def test_errors_of_objects_name_location_value_and_remedy(change: str, expected: str) -> None:
+    shape = (
+        'kind = "bolt", diameter_mm = 10.0, length_mm = 40.0, head_diameter_mm = 17.0, head_length_mm = 6.4'
+    )
+    key = change.partition(" =")[0]
+    if key in shape:
+        words = [change if word.startswith(f"{key} ") else word for word in shape.split(", ")]
+        shape = ", ".join(words)
+    text = SMALL.replace("[[hand]]", f"[object.bolt]\nshape = {{ {shape} }}\n\n[[hand]]", 1)
+    text = text.replace('name = "right"', f'name = "right"\n{change if key == "object" else ""}', 1)
+    assert expected in config_error(text)
+
+
+def test_the_file_of_a_mesh_is_relative_to_the_deployment(tmp_path: Path) -> None:
+    mesh = '[object.mug]\nshape = { kind = "mesh", file = "mug.stl" }\n\n[[hand]]'
+    (tmp_path / "hand.toml").write_text(SMALL.replace("[[hand]]", mesh, 1))
+    shape = config.load(tmp_path / "hand.toml").objects["mug"].shape
+    assert shape.kind == "mesh"
+    assert shape.file == str(tmp_path / "mug.stl")
+
+
 @pytest.mark.parametrize(("change", "expected"), ERRORS.values(), ids=ERRORS.keys())
 def test_config_error_names_location_value_and_remedy(change: tuple[str, str], expected: str) -> None:
     assert SMALL.count(change[0]) >= 1
