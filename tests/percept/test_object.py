@@ -254,6 +254,14 @@ def test_without_object_or_contact_the_pose_is_undetermined() -> None:
     assert (found.state, found.reason) == ("undetermined", "nothing touches the object")
 
 
+def test_without_the_pose_of_a_link_the_reason_is_that_joint_states_are_missing() -> None:
+    hand = Hand(known("sphere"))
+    hand.origin_m[:] = np.nan
+    found = hand.step(*feet_of("sphere", 1))
+    assert (found.state, found.poses) == ("undetermined", ())
+    assert "joint states" in found.reason
+
+
 def test_a_mesh_that_is_missing_is_the_reason_of_an_undetermined_pose() -> None:
     found = Hand(f"thing={table('mesh', file='/nowhere.stl').model_dump_json()}").step(*feet_of("sphere", 1))
     assert found.state == "undetermined"

@@ -201,8 +201,8 @@ class PerceptClient:
         if not (due and np.count_nonzero(self._object_pads[rows])):
             return {}
         self._snapshot_ns[hand] = sync_ns
-        if (poses := self._pipeline.link_poses(hand, sync_ns)) is None:
-            return {}
+        unknown = np.full((rows.stop - rows.start, 12), np.nan), np.full(12, np.nan)
+        poses = self._pipeline.link_poses(hand, sync_ns) or unknown
         clear = (self._pipeline.tick.columns.state[rows] == PadState.CLEAR) & self._object_pads[rows]
         return {
             "clear": clear.astype("<u1").tobytes(),

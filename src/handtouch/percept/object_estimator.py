@@ -101,6 +101,10 @@ class _TrackedObject:
         """Return the estimate at a snapshot; free_m: (p, f, 3), points of the hand's pads in their links."""
         if self.sampler is None or self.shape is None:
             return self._undetermined(now, self.problem or "no object is stated for this hand")
+        if not np.isfinite(now.origin_m).any():
+            return self._undetermined(
+                now, "no link's pose is known; send joint states, to a hand with a URDF"
+            )
         touched = _touched_pads(buffer, now)
         self._follow_motion(now)
         if now.t_ns - self.last_touch_ns > _MEMORY_NS:
