@@ -24,7 +24,7 @@ duration_s = 3.0
 path = [[0.5, 0.5]]
 force_n = [1.5]
 """
-JOINTS = {"index_mcp": 0.5, "index_pip": 0.4, "index_dip": 0.3}
+JOINTS = {"index_abduction": 0.1, "index_mcp": 0.5, "index_pip": 0.4, "index_dip": 0.3}
 
 
 def test_a_ball_stated_over_control_is_placed_where_the_touched_pad_says(rig: Any) -> None:

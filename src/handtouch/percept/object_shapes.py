@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from handtouch.config.objects import (
@@ -246,6 +245,8 @@ def _grid_of_mesh(file: Path, unit_m: float) -> _Grid:
 
 def _distance_from_corners(corners: FloatArray, points: FloatArray, spacing_m: float) -> FloatArray:
     """Return distances (n,) of points from triangles (t, 3, 3), found by samples so far apart."""
+    from scipy.spatial import cKDTree  # only here, as few objects are meshes
+
     samples, owner = _sample_triangles(corners, spacing_m)
     _, nearest = cKDTree(samples).query(points, _NEAREST)
     squares = [
