@@ -56,7 +56,7 @@ MIN_WEIGHT = 0.7
 MAX_POSITION_STD_M, MAX_ROTATION_STD_RAD = 8e-3, math.radians(20)
 """A pose is `estimated` within these; the greatest standard deviation of any direction counts."""
 _MIN_EFFECTIVE_SAMPLES = 5.0
-_EQUATIONS_PER_POINT = 3  # a distance, and two angles of the normal
+_EQUATIONS_PER_PAD = 3  # a distance, and two angles of the normal
 _log = logging.getLogger("handtouch.percept")
 
 
@@ -246,8 +246,9 @@ class _TrackedObject:
         if self.sampler.outliers > MAX_OUTLIERS:
             return "invalid", f"the contacts fit no pose of {self.name}"
         assert self.shape is not None
-        if _EQUATIONS_PER_POINT * len(self.points) < 6 - self.shape.free_axes:
-            return "undetermined", "one contact leaves it open; touch another side"
+        pads = len({point.pad for point in self.points})  # points of one pad share its errors
+        if _EQUATIONS_PER_PAD * pads < 6 - self.shape.free_axes:
+            return "undetermined", "one pad leaves it open; touch it with another, too"
         if found[0].weight < MIN_WEIGHT:
             return "undetermined", f"{len(found)} hypotheses; the likeliest has {found[0].weight:.0%}"
         if self.sampler.effective_samples < _MIN_EFFECTIVE_SAMPLES:
