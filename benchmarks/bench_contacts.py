@@ -235,8 +235,9 @@ def state_tables(report: Report, found: Mapping[str, Estimates]) -> None:
         for state in dict.fromkeys(every.columns["state"].tolist()):
             of_state = every.where(every.columns["state"] == state)
             rows.append({"case": f"{state}, all"} | row_of(of_state, scale))
-            for shape in dict.fromkeys(of_state.columns["shape"].tolist()):
-                own = of_state.where(of_state.columns["shape"] == shape)
+            shapes = of_state.columns["shape"]
+            for shape in ("all shapes", *dict.fromkeys(shapes.tolist())):
+                own = of_state.where((shapes == shape) | (shape == "all shapes"))
                 for low in range(4):
                     cell = own.where(own.columns["range"] == low)
                     ends = f"{FORCES_N[low]:g} to {FORCES_N[low + 1]:g} N"
@@ -249,54 +250,61 @@ def main() -> None:
     parser.add_argument("--hands", type=int, default=6, help="of the profiles")
     parser.add_argument("--disturbed", type=int, default=3, help="hands of each disturbance")
     parser.add_argument("--each", type=int, default=5, help="touches of a pad in each profile and range")
-    parser.add_argument("--only", default="", help="profiles, or disturbances whose names contain this")
+    parser.add_argument(
+        "--only", default="", help="profiles, disturbances, or those named so (keeps no page)"
+    )
     parser.add_argument("--tuning", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.disturbed, asked.each = 1, 1, 1
     family = Family.TUNING if asked.tuning else Family.REPORTING
-    profiles = [
-        Task(DISTURBANCES[0], SHAPES, number, asked.each, True, family)
-        for number in range(asked.hands if asked.only in ("", "profiles") else 0)
-    ]
-    disturbed = [
-        Task(one, ROUND, number, asked.each, one.learns, family)
-        for one in DISTURBANCES
-        if asked.only in one.name
-        for number in range(asked.disturbed)
-    ]
-    report = Report(
-        asked.quick or asked.tuning or bool(asked.only),
-        hands=asked.hands,
-        hands_of_a_disturbance=asked.disturbed,
-        touches_of_a_pad_in_a_cell=asked.each,
-    )
+    named = "" if asked.only in ("profiles", "disturbances") else asked.only
+    quick = asked.quick or asked.tuning or bool(named)
+    if asked.only in ("", "profiles"):
+        tasks = [
+            Task(DISTURBANCES[0], SHAPES, number, asked.each, True, family) for number in range(asked.hands)
+        ]
+        made = played(tasks, asked.processes)
+        report = Report(quick, "profiles", hands=asked.hands, touches_of_a_pad_in_a_cell=asked.each)
+        state_tables(report, {q: concatenate([one[q] for one in made]) for q in ("position", "force")})
+        report.keep()
+    if asked.only != "profiles":
+        tasks = [
+            Task(one, ROUND, number, asked.each, one.learns, family)
+            for one in DISTURBANCES
+            if named in one.name
+            for number in range(asked.disturbed)
+        ]
+        made = played(tasks, asked.processes)
+        report = Report(quick, "disturbances", hands=asked.disturbed, touches_of_a_pad_in_a_range=asked.each)
+        report.table("Disturbances", disturbance_rows(tasks, made))
+        report.keep()
+
+
+def played(tasks: Sequence[Task], processes: int) -> list[dict[str, Estimates]]:
+    """Return the estimates of each hand."""
     made = []
-    with ProcessPoolExecutor(asked.processes) as pool:
-        for task, result in zip(
-            (*profiles, *disturbed), pool.map(play, (*profiles, *disturbed)), strict=True
-        ):
+    with ProcessPoolExecutor(processes) as pool:
+        for task, result in zip(tasks, pool.map(play, tasks), strict=True):
             progress(f"{task.disturbance.name}, hand {task.number + 1}")
             made.append(result)
-    if profiles:
-        of_profiles = made[: len(profiles)]
-        state_tables(report, {q: concatenate([one[q] for one in of_profiles]) for q in ("position", "force")})
+    return made
+
+
+def disturbance_rows(tasks: Sequence[Task], made: Sequence[dict[str, Estimates]]) -> list[dict[str, Any]]:
+    """Return a row for each disturbance and state."""
     rows = []
-    for name in dict.fromkeys(task.disturbance.name for task in disturbed):
+    for name in dict.fromkeys(task.disturbance.name for task in tasks):
         of_row = [
-            one["position"]
-            for task, one in zip(disturbed, made[len(profiles) :], strict=True)
-            if task.disturbance.name == name
+            one["position"] for task, one in zip(tasks, made, strict=True) if task.disturbance.name == name
         ]
         every = concatenate(of_row)
         rows += [
             {"case": f"{name}, {state}"} | row_of(every.where(every.columns["state"] == state))
             for state in dict.fromkeys(every.columns["state"].tolist())
         ]
-    if rows:
-        report.table("Disturbances", rows)
-    report.keep()
+    return rows
 
 
 if __name__ == "__main__":

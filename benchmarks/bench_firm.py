@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.bench_contacts import WORLD
 from benchmarks.hand_touches import position_error, serve
-from benchmarks.page import Limit, Report, options, progress
+from benchmarks.page import Report, options, progress
 from benchmarks.scores import ClusterShare
 from handtouch import wire
 from handtouch.config import load, shipped
@@ -96,7 +96,7 @@ def columns_of(found: list[wire.Contact | None], truth: GroundTruth) -> tuple[fl
     lost = len(known) < len(found) or len({one.id for one in known}) > 1
     error, covariance = position_error(judged, truth)
     located = bool(np.isfinite(error).all())
-    inside = located and error @ np.linalg.solve(covariance, error) < IN_REGION
+    inside = located and bool(error @ np.linalg.solve(covariance, error) < IN_REGION)
     valid = judged is not None and judged.force_status == VALID and judged.force_std_n is not None
     bound = judged is not None and judged.force_status == BOUND
     true = False
@@ -144,16 +144,10 @@ def main() -> None:
         )
     report = Report(asked.quick or asked.tuning, hands=asked.hands, presses_of_a_pad=asked.presses)
     report.table("Presses", rows)
-    report.limits += [
-        Limit("presses whose contact ended or lost a number", rows[-1]["ended or unknown"], 0),
-        Limit(
-            "interval or bound true",
-            100 * rows[-1]["interval or bound true"].value,
-            95.0,
-            "%",
-            at_least=True,
-        ),
-    ]
+    every = rows[-1]
+    report.limit("presses whose contact ended or lost a number", every["ended or unknown"], 0)
+    true = 100 * every["interval or bound true"].value
+    report.limit("interval or bound true", true, 95.0, "%", at_least=True)
     report.keep()
 
 
