@@ -201,7 +201,7 @@ def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
 
 
 def _is_finite(value: float) -> bool:
-    return -_INFINITY < value < _INFINITY
+    return -_INFINITY < float(value) < _INFINITY  # a number of a row isn't one of Python's
 
 
 def _is_located(contacts: RowArray, pad: int) -> bool:
