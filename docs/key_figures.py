@@ -43,6 +43,7 @@ def draw_all(folder: Path) -> None:
         "slip": draw_slip,
         "diagnosis": draw_diagnosis,
         "swap": draw_swap,
+        "light_touch": draw_light_touch,
     }
     with matplotlib.rc_context(STYLE):
         for name, draw in figures.items():
@@ -202,6 +203,24 @@ def draw_diagnosis(axes: Axes) -> None:
     axes.bar_label(bars, fmt="%.0f", padding=3)
     axes.set(xlabel="episodes with the correct diagnosis, %", xlim=(0, 112))
     axes.invert_yaxis()
+
+
+def draw_light_touch(axes: Axes) -> None:
+    """Share of steps that are seen within 50 ms by force, with offered thresholds, and what sheets allow."""
+    colours = dict(zip(WORLDS, (GREY, BLUE, ORANGE), strict=True))
+    for world in WORLDS[1:]:
+        rows = table("light_touch", "Touches", f"{world}: touches")
+        rows = [row for row in rows if row["speed, N/s"] == "step"]
+        force = [1000 * float(row["force, N"]) for row in rows]
+        for column, style in (("within 50 ms", "o-"), ("seen as shipped", "s:"), ("sheet responds", "--")):
+            label = f"{world}, {column}" if column != "within 50 ms" else f"{world}, offered"
+            share = [number(row[column]) for row in rows]
+            axes.plot(force, share, style, color=colours[world], label=label, markersize=4)
+    axes.axvline(2 * 9.80665, color=GREY, linewidth=0.8)
+    axes.annotate("2 gf", (2 * 9.80665, 103), ha="center", fontsize=8)
+    axes.set(xlabel="force of a step, mN", ylabel="share of touches, %", xscale="log", ylim=(0, 110))
+    axes.set_xticks([10, 20, 50, 100], labels=["10", "20", "50", "100"])
+    axes.legend(frameon=False, fontsize=7)
 
 
 def draw_swap(axes: Axes) -> None:
