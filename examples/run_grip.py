@@ -17,7 +17,7 @@ from handtouch.config import shipped
 from handtouch.simulate import TactileNodes
 from handtouch.simulate.tactile.grip_environment import EPISODE_STEPS, PERIOD_S, TOUCH, GripScene
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 """Time for the daemon's start, or for sheets that were pressed to settle"""
 
 
