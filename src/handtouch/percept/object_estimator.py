@@ -56,7 +56,8 @@ MIN_WEIGHT = 0.7
 MAX_POSITION_STD_M, MAX_ROTATION_STD_RAD = 8e-3, math.radians(20)
 """A pose is `estimated` within these; the greatest standard deviation of any direction counts."""
 _MIN_EFFECTIVE_SAMPLES = 5.0
-_EQUATIONS_PER_PAD = 3  # a distance, and two angles of the normal
+_MIN_PADS_OF_SPHERE, _MIN_PADS = 1, 3
+"""A pad gives three equations; two leave none over that would show a wrong pose of six unknowns."""
 _log = logging.getLogger("handtouch.percept")
 
 
@@ -247,8 +248,8 @@ class _TrackedObject:
             return "invalid", f"the contacts fit no pose of {self.name}"
         assert self.shape is not None
         pads = len({point.pad for point in self.points})  # points of one pad share its errors
-        if _EQUATIONS_PER_PAD * pads < 6 - self.shape.free_axes:
-            return "undetermined", "one pad leaves it open; touch it with another, too"
+        if pads < (_MIN_PADS_OF_SPHERE if self.shape.free_axes == 3 else _MIN_PADS):
+            return "undetermined", f"{pads} pads leave it open; touch it with {_MIN_PADS}"
         if found[0].weight < MIN_WEIGHT:
             return "undetermined", f"{len(found)} hypotheses; the likeliest has {found[0].weight:.0%}"
         if self.sampler.effective_samples < _MIN_EFFECTIVE_SAMPLES:
