@@ -249,7 +249,7 @@ class _TrackedObject:
         assert self.shape is not None
         pads = len({point.pad for point in self.points})  # points of one pad share its errors
         if pads < (_MIN_PADS_OF_SPHERE if self.shape.free_axes == 3 else _MIN_PADS):
-            return "undetermined", f"{pads} pads leave it open; touch it with {_MIN_PADS}"
+            return "undetermined", f"touched by {pads} of the {_MIN_PADS} pads that it needs"
         if found[0].weight < MIN_WEIGHT:
             return "undetermined", f"{len(found)} hypotheses; the likeliest has {found[0].weight:.0%}"
         if self.sampler.effective_samples < _MIN_EFFECTIVE_SAMPLES:
