@@ -422,7 +422,9 @@ def test_a_new_sheet_on_the_same_node_sets_aside_what_the_old_one_taught(bench: 
     np.testing.assert_array_equal(rig.pipeline.tick.sheet_force.learned_of(0), fresh)
     rig.receive(calibrate(0, 11, calibration_id="11-3", law=law))  # the new one's, measured
     rig.step()
-    assert rig.pipeline.calibrations[0].law.contact_ohm_mm2 == 21_000.0
+    measured = rig.pipeline.calibrations[0].law
+    assert measured is not None
+    assert measured.contact_ohm_mm2 == 21_000.0
 
 
 def test_learned_behaviour_that_no_sheet_has_is_refused(bench: Any) -> None:

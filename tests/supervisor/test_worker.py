@@ -206,7 +206,11 @@ def test_a_new_sheet_stored_by_another_process_is_announced_with_the_gains_of_th
         Gains(before.calibration.gains.factors, before.calibration.gains.covariance)
     )
     (applied,) = calibrations(later(bench, worker, 6.0), 0)
-    assert (applied.calibration_id, applied.new_sheet, applied.parts) == (made, True, None)
+    assert (applied.calibration_id, applied.new_sheet) == (made, True)
+    assert applied.parts is not None  # as the deployment states, without what contacts taught
+    assert not any(applied.parts.offsets)
+    taught = np.array(applied.parts.covariance)[4:, 4:]
+    np.testing.assert_allclose(np.diag(taught), 1.0)  # in units of the stated deviations
     assert applied.gains == pytest.approx(before.calibration.gains.factors)
     with Store(swapped[1]) as store:  # for the tests after this one
         store.roll_back(11, before.number, Provenance(""), NOW)
