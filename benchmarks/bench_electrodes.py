@@ -135,11 +135,9 @@ def rectangle_deployment(counts: Sequence[int]) -> Deployment:
     return parse("".join(text))
 
 
-def play_many(
-    number: int, touches: int, counts: Sequence[int], family: Family = Family.REPORTING
-) -> Estimates:
+def play_many(number: int, touches: int, counts: Sequence[int]) -> Estimates:
     """Return estimates of the position on rectangles with many electrodes, in each state."""
-    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(family.seed(number))
+    drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.REPORTING.seed(number))
     deployment = drawn.describe(rectangle_deployment(counts))
     model, numbers = PadModel(deployment), range(WARM_UP, WARM_UP + touches)
     others = range(numbers.stop, numbers.stop + round(DRAWN_PER_LEARNT * LEARNT) + DRAWN_MORE)
