@@ -174,7 +174,7 @@ class UnevenNetwork(ElectrodeNetwork):
 def _film_change(even: ElectrodeNetwork, film: Film, surface: Surface, contact_radius: float) -> _Change:
     from scipy.interpolate import RectBivariateSpline  # not loaded with the package
 
-    grid = _Grid(even)
+    grid = _FilmGrid(even)
     log_ratio = film.log_ratio(surface, even.sheet_ohm_per_square)
     flat, uneven = grid.solve(np.ones(grid.cells)), grid.solve(np.exp(-log_ratio(*grid.middles)))
     shares = uneven.potentials - flat.potentials
@@ -190,7 +190,7 @@ def _film_change(even: ElectrodeNetwork, film: Film, surface: Surface, contact_r
     return _Change(splines, radius, uneven.conductance - flat.conductance, digest)
 
 
-class _Grid:
+class _FilmGrid:
     """Bilinear elements on a network's rectangle."""
 
     def __init__(self, network: ElectrodeNetwork) -> None:

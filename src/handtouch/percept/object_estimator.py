@@ -23,7 +23,7 @@ from handtouch.config.objects import ObjectTable
 from handtouch.percept.object_pose import (
     MAX_CONTACT_COST,
     MAX_OUTLIERS,
-    Evidence,
+    PoseEvidence,
     PoseHypothesis,
     PoseSampler,
 )
@@ -180,7 +180,7 @@ class _TrackedObject:
             self.points.append(new)
         del self.points[:-_MAX_POINTS]
 
-    def _evidence(self, now: HandSnapshot, touched: IntArray, free_m: FloatArray) -> Evidence:
+    def _evidence(self, now: HandSnapshot, touched: IntArray, free_m: FloatArray) -> PoseEvidence:
         points = self.points
         known = np.isfinite(now.origin_m).all(axis=1)
         is_touched = np.isin(np.arange(len(now.origin_m)) + now.first, touched)
@@ -188,7 +188,7 @@ class _TrackedObject:
         placed = free_m[rows] @ now.rotation[rows].transpose(0, 2, 1) + now.origin_m[rows][:, None]
         moved = np.array([p.variance_m2 + p.moved_m2 for p in points])
         turned = np.array([p.turned_rad2 for p in points])
-        return Evidence(
+        return PoseEvidence(
             np.array([p.point_m for p in points]),
             np.array([p.normal for p in points]),
             np.sqrt(moved + _SKIN_STD_M**2),
@@ -197,7 +197,7 @@ class _TrackedObject:
             np.where(is_touched[rows], _TOUCHED_STD_M, _CLEAR_STD_M),
         )
 
-    def _is_another_place(self, evidence: Evidence, touched: IntArray) -> bool:
+    def _is_another_place(self, evidence: PoseEvidence, touched: IntArray) -> bool:
         """Return whether the likeliest pose contradicts most earlier points, or most present ones: the object
         fell or was turned in between."""
         assert self.sampler is not None

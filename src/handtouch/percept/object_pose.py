@@ -6,7 +6,7 @@ and weighted by their likelihood over that density. So modes, their weights and 
 one set of samples; nothing is multiplied over time.
 
 A perturbation of a pose is (translation, rotation) (6,), in the frame of the evidence, about the object's
-centre. Public names: `Evidence`, `Poses`, `PoseHypothesis`,
+centre. Public names: `PoseEvidence`, `Poses`, `PoseHypothesis`,
 `PoseSampler`, `MAX_CONTACT_COST`, `MAX_OUTLIERS`, `FREE_ROTATION_RAD2`.
 """
 
@@ -58,7 +58,7 @@ _OPPOSITE = 1e-6  # sine of the angle between axes that count as opposite
 _MIN_SCATTER = 10
 
 
-class Evidence(NamedTuple):
+class PoseEvidence(NamedTuple):
     """Touched points (c,) and points of untouched pads (p, f), in one frame."""
 
     point_m: FloatArray
@@ -148,7 +148,7 @@ class PoseSampler:
         """Move the samples with the object."""
         self.poses = self.poses.moved(rotation, translation_m)
 
-    def update(self, evidence: Evidence) -> None:
+    def update(self, evidence: PoseEvidence) -> None:
         """Draw new samples, given at least one contact."""
         evidence = self._near(evidence)
         proposals = self._refine(self._start_poses(evidence), evidence)
@@ -165,7 +165,7 @@ class PoseSampler:
         self.outliers = float(np.mean(self._contact_costs(best, evidence) > MAX_CONTACT_COST))
         self.hypotheses = self._merge(proposals, component_density.responsible)
 
-    def log_likelihood(self, poses: Poses, evidence: Evidence) -> FloatArray:
+    def log_likelihood(self, poses: Poses, evidence: PoseEvidence) -> FloatArray:
         """Return ln of the likelihood (k,) of the evidence, but for a constant."""
         cost = _capped(self._contact_costs(poses, evidence), MAX_CONTACT_COST).sum(axis=1)
         if len(evidence.free_m):
@@ -173,7 +173,7 @@ class PoseSampler:
             cost += _capped(0.5 * depth**2, _MAX_PAD_COST).sum(axis=1)
         return np.asarray(-cost)
 
-    def contact_costs(self, hypothesis: PoseHypothesis, evidence: Evidence) -> FloatArray:
+    def contact_costs(self, hypothesis: PoseHypothesis, evidence: PoseEvidence) -> FloatArray:
         """Return the cost (c,) of each contact at a hypothesis, in -ln of the likelihood."""
         pose = Poses(hypothesis.position_m[None], hypothesis.quaternion[None])
         return np.asarray(self._contact_costs(pose, evidence)[0])
@@ -189,7 +189,7 @@ class PoseSampler:
         """There are no samples that fit."""
         return not len(self.weights) or self.outliers > MAX_OUTLIERS
 
-    def _start_poses(self, evidence: Evidence) -> Poses:
+    def _start_poses(self, evidence: PoseEvidence) -> Poses:
         """Return poses to refine: some of the samples, also turned about, and alignments with a contact."""
         if self._is_lost:
             return self._alignments(evidence, _FIRST_STARTS)
@@ -207,7 +207,7 @@ class PoseSampler:
         steps = (np.arange(count) + self._rng.random()) / count
         return np.minimum(np.searchsorted(np.cumsum(shares), steps), len(shares) - 1)
 
-    def _alignments(self, evidence: Evidence, count: int) -> Poses:
+    def _alignments(self, evidence: PoseEvidence, count: int) -> Poses:
         rng, n = self._rng, _ALIGNMENTS
         contact, foot = rng.integers(len(evidence.point_m), size=n), rng.integers(len(self._feet), size=n)
         turn = _turns_between(self._normals[foot], -evidence.normal[contact])
@@ -219,7 +219,7 @@ class PoseSampler:
         chosen = np.argsort(fit / _ALIGNMENT_TEMPERATURE + rng.gumbel(size=n))[-count:]
         return poses.take(chosen)
 
-    def _refine(self, poses: Poses, evidence: Evidence) -> _Proposals:
+    def _refine(self, poses: Poses, evidence: PoseEvidence) -> _Proposals:
         information = np.zeros((len(poses.position_m), 6, 6))
         iterations = _FIRST_ITERATIONS if self._is_lost else _ITERATIONS
         for iteration in range(iterations + 1):
@@ -233,7 +233,7 @@ class PoseSampler:
         kept = score > score.max() - _MAX_LOG_GAP
         return _Proposals(poses.take(kept), covariance[kept], found.log_likelihood[kept])
 
-    def _normal_equations(self, poses: Poses, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+    def _normal_equations(self, poses: Poses, evidence: PoseEvidence) -> tuple[FloatArray, FloatArray]:
         """Return the gradient (k, 6) of the cost and its information (k, 6, 6), with that of the kernel."""
         k, c = len(poses.position_m), len(evidence.point_m)
         steps = np.diag([_STEP_M] * 3 + [_STEP_RAD] * 3)
@@ -251,7 +251,9 @@ class PoseSampler:
         information[:, 3:, 3:] += _PINNED * self._free_projector(poses)
         return slope, information
 
-    def _add_pads(self, poses: Poses, evidence: Evidence, slope: FloatArray, information: FloatArray) -> None:
+    def _add_pads(
+        self, poses: Poses, evidence: PoseEvidence, slope: FloatArray, information: FloatArray
+    ) -> None:
         if not len(evidence.free_m):
             return
         depth, deepest = self._pad_depths_at(poses, evidence)
@@ -310,7 +312,7 @@ class PoseSampler:
         covariance[3:, 3:] += FREE_ROTATION_RAD2 * self._free_projector(pose)[0]
         return PoseHypothesis(weight, pose.position_m[0], pose.quaternion[0], covariance)
 
-    def _contact_residuals(self, poses: Poses, evidence: Evidence) -> FloatArray:
+    def _contact_residuals(self, poses: Poses, evidence: PoseEvidence) -> FloatArray:
         """Return residuals (k, c, 4) of distance and normal, in standard deviations."""
         rotations = poses.matrices
         outside = evidence.point_m - _OFFSET_M * evidence.normal
@@ -323,14 +325,14 @@ class PoseSampler:
         ]
         return found
 
-    def _contact_costs(self, poses: Poses, evidence: Evidence) -> FloatArray:
+    def _contact_costs(self, poses: Poses, evidence: PoseEvidence) -> FloatArray:
         return np.asarray(0.5 * np.square(self._contact_residuals(poses, evidence)).sum(axis=2))
 
-    def _pad_depths(self, poses: Poses, evidence: Evidence) -> FloatArray:
+    def _pad_depths(self, poses: Poses, evidence: PoseEvidence) -> FloatArray:
         """Return the deepest distance (k, p) of each pad, in standard deviations, 0 outside the object."""
         return self._pad_depths_at(poses, evidence)[0]
 
-    def _pad_depths_at(self, poses: Poses, evidence: Evidence) -> tuple[FloatArray, FloatArray]:
+    def _pad_depths_at(self, poses: Poses, evidence: PoseEvidence) -> tuple[FloatArray, FloatArray]:
         """Return depths as `_pad_depths`, and the deepest points (k, p, 3)."""
         middle = evidence.free_m.mean(axis=1)
         reach = np.linalg.norm(evidence.free_m - middle[:, None], axis=2).max(axis=1)
@@ -345,7 +347,7 @@ class PoseSampler:
         deepest[pose, pad] = evidence.free_m[pad, at]
         return depth, deepest
 
-    def _near(self, evidence: Evidence) -> Evidence:
+    def _near(self, evidence: PoseEvidence) -> PoseEvidence:
         """Return the evidence without pads that the object can't reach from any contact."""
         if not len(evidence.free_m):
             return evidence
