@@ -227,10 +227,10 @@ def _box_symmetries(half_m: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _grid_of_mesh(file: Path, unit_m: float) -> _Grid:
-    from handtouch.field import read_stl  # only here: few objects are meshes
+    from handtouch.field.triangulation import parse_stl  # only here: few objects are meshes
 
-    vertices, triangles = read_stl(file)
-    corners = unit_m * vertices[triangles]
+    surface = parse_stl(file.read_bytes())
+    corners = unit_m * surface.points[surface.triangles]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     middle, half = (low + high) / 2, (high - low) / 2
     corners = corners - middle
