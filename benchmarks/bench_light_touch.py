@@ -118,8 +118,8 @@ def touched(world: str, seed: int) -> list[Row]:
     last = max(touch.until_s for touch in touches) + 1.0
     for times_s in tick_times(first, last - first, TOUCH_NS):
         counts = np.stack([hand.counts(row, times_s) for row in range(PADS)], axis=1)
-        for t_s, row in zip(times_s.tolist(), np.tile(counts, (1, 2, 1)), strict=True):
-            began += [(t_s, pad) for pad in bench.run_tick(row, round(1e9 * t_s)).began.tolist()]
+        for t_s, sample in zip(times_s.tolist(), np.tile(counts, (1, 2, 1)), strict=True):
+            began += [(t_s, pad) for pad in bench.run_tick(sample, round(1e9 * t_s)).began.tolist()]
     found = []
     for number, touch in enumerate(touches):
         (force, speed, reached_s), pad = slots[number // PADS], number % PADS
@@ -222,8 +222,8 @@ def held(world: str, seed: int) -> list[Row]:
     events: list[tuple[float, int, bool]] = []
     for times_s in tick_times(START_S + MEASURED_S, HOLD_S + 180.0, HOLD_NS):
         counts = quiet.counts(times_s)
-        for row in HOLD_ROWS:
-            counts[:, row] = hand.counts(row, times_s)
+        for held in HOLD_ROWS:
+            counts[:, held] = hand.counts(held, times_s)
         for t_s, sample in zip(times_s.tolist(), np.tile(counts, (1, 2, 1)), strict=True):
             result = bench.run_tick(sample, round(1e9 * t_s))
             events += [(t_s, pad, True) for pad in result.began.tolist()]

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config import shipped
 from handtouch.config.channels import node_channels
+from handtouch.core.columns import TickResult
 from handtouch.core.least_threshold import LevelScatter, least_begin_counts
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import CountSlab, Cycle
-from handtouch.core.tick import TickProcessor, TickResult
+from handtouch.core.tick import TickProcessor
 from handtouch.simulate.channel_errors import ChannelErrors
 from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.scenario import Scenario
@@ -127,7 +128,7 @@ class QuietHand:
     def counts(self, times_s: FloatArray) -> CountArray:
         """Return the samples (ticks, pads, channels) at successive times."""
         shape = (len(times_s), *self._low.shape)
-        counts = self._noise[:, None] * self._rng.standard_normal(shape, np.float32)
+        counts = np.asarray(self._noise[:, None] * self._rng.standard_normal(shape, np.float32), np.float64)
         if not self._drift.is_constant:
             coarse = np.arange(np.floor(times_s[0]), times_s[-1] + 2)  # its periods are 30 s and more
             zeros, steps = self._drift.zero_counts(coarse), times_s - coarse[0]
@@ -145,7 +146,7 @@ def tick_times(from_s: float, length_s: float, period_ns: int) -> list[FloatArra
     """Return the times of ticks [s], chunk by chunk."""
     ticks = np.arange(round(length_s / (period_ns * 1e-9)))
     return [
-        from_s + part * (period_ns * 1e-9)
+        np.asarray(from_s + part * (period_ns * 1e-9), np.float64)
         for part in np.split(ticks, range(CHUNK_TICKS, len(ticks), CHUNK_TICKS))
     ]
 

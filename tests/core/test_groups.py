@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 from hypothesis import given
@@ -23,7 +24,7 @@ class Contacts:
     def __init__(self, n: int = 4, hand: tuple[int, ...] | None = None) -> None:
         self.state = TickState.empty(n)
         self.state.palm_requested[:] = True
-        palm = view_rows(self.state.palm_values, CONTACT_FRAMES)["palm"]
+        palm: Any = view_rows(self.state.palm_values, CONTACT_FRAMES)["palm"]
         self.groups = ContactGroups(np.full(n, 0.02), np.array(hand or [0] * n), self.state, palm)
 
 

@@ -89,7 +89,8 @@ def test_with_known_gravity_a_hand_that_turns_once_a_second_has_no_contact_but_t
     assert begin[1] == "index_distal"
     assert begin[0] == pytest.approx(TOUCHED_S, abs=0.2)
     (end,) = ended
-    assert end == (pytest.approx(TOUCHED_S + 10.0, abs=0.2), "index_distal")
+    assert end[0] == pytest.approx(TOUCHED_S + 10.0, abs=0.2)
+    assert end[1] == "index_distal"
 
 
 def test_without_gravity_the_weight_of_the_skin_begins_contacts() -> None:

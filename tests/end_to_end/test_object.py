@@ -40,7 +40,8 @@ def test_a_ball_stated_over_control_is_placed_where_the_touched_pad_says(rig: An
     assert control.object("right", "ball")["table"] == {
         "shape": {"kind": "sphere", "diameter_mm": 2e3 * RADIUS_M}
     }
-    end_s, reasons = time.monotonic() + LONGEST_S, set()
+    end_s = time.monotonic() + LONGEST_S
+    reasons: set[str] = set()
     contact = None
     with (
         Robot(rig.endpoints["inputs"], key="") as robot,

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from handtouch.config import ObjectTable
 from handtouch.percept.object_estimator import ObjectEstimator
-from handtouch.percept.object_pose import FREE_ROTATION_RAD2, Evidence, PoseHypothesis, PoseSampler
+from handtouch.percept.object_pose import FREE_ROTATION_RAD2, PoseEvidence, PoseHypothesis, PoseSampler
 from handtouch.percept.object_shapes import KnownShape, build_shape
 from handtouch.percept.samples import ContactBuffer, ContactSamples, HandSnapshot, PerceptEstimate
 
@@ -36,14 +36,14 @@ def touches(
     position: FloatArray,
     feet: tuple[FloatArray, FloatArray],
     seed: int,
-) -> Evidence:
+) -> PoseEvidence:
     """Return touches at points of the surface with normals, with the errors that the evidence states."""
     rng = np.random.default_rng(seed)
     points = rotation.apply(feet[0]) + position + POINT_STD_M * rng.normal(size=feet[0].shape)
     normals = -rotation.apply(feet[1]) + NORMAL_STD_RAD * rng.normal(size=feet[0].shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     c = len(points)
-    return Evidence(
+    return PoseEvidence(
         points,
         normals,
         np.full(c, POINT_STD_M),
@@ -53,7 +53,7 @@ def touches(
     )
 
 
-def sampled(shape: KnownShape, evidence: Evidence, seed: int = 0) -> PoseSampler:
+def sampled(shape: KnownShape, evidence: PoseEvidence, seed: int = 0) -> PoseSampler:
     sampler = PoseSampler(shape, seed)
     for _ in range(5):
         sampler.update(evidence)
@@ -170,7 +170,7 @@ def test_the_rotation_of_a_sphere_is_undetermined_and_its_position_isnt() -> Non
     assert np.linalg.norm(found.position_m - 0.1) < 3e-3
 
 
-def shank_touches() -> tuple[KnownShape, Evidence]:
+def shank_touches() -> tuple[KnownShape, PoseEvidence]:
     """Return touches around the shank of a bolt that lies along z: either end may be the head."""
     shape = build_shape(table("bolt"))
     angle, height = np.array([0.0, 2.1, 4.2, 1.0, 3.1]), np.array([-12e-3, 12e-3, 0.0, -6e-3, 6e-3])

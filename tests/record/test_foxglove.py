@@ -138,7 +138,7 @@ def test_two_contacts_of_a_pad_are_two_more_points_with_their_forces() -> None:
 
 def test_hypotheses_about_an_object_are_drawn_in_the_palm_and_a_determined_pose_is_published() -> None:
     covariance = np.diag([4e-6, 1e-6, 1e-6, 1e-2, 1e-2, 1e-2])
-    pose = {"palm_position_m": [0.07, 0.0, 0.03], "palm_quaternion": [0.0, 0.0, 0.0, 1.0]}
+    pose: dict[str, Any] = {"palm_position_m": [0.07, 0.0, 0.03], "palm_quaternion": [0.0, 0.0, 0.0, 1.0]}
     pose |= {"weight": 0.8, "palm_covariance": covariance.ravel().tolist()}
     percept = {
         "kind": "object",

@@ -129,5 +129,5 @@ def test_resized_meshes_are_longer_and_wider_about_their_middle() -> None:
     assert resized.length_m - shape().length_m == pytest.approx(0.4e-3, rel=0.3)
     assert resized.arc - shape().arc == pytest.approx(-0.3e-3, rel=0.3)
     middles = [made.point(made.length_m / 2, made.arc / 2) for made in (shape(), resized)]
-    np.testing.assert_allclose(*middles, atol=1e-5)
+    np.testing.assert_allclose(middles[0], middles[1], atol=1e-5)
     assert shape().resized(0.0, 0.0) == shape()

@@ -34,7 +34,7 @@ def parse_stl(data: bytes) -> Triangulation:
         try:
             corners = np.array(rows, np.float64)
         except ValueError:
-            corners = np.zeros(0)
+            corners = np.zeros((0, 3))
     if not corners.size or len(corners) % 3 or not np.isfinite(corners).all():
         raise ValueError("no STL file with triangles")
     corners = corners.astype(np.float64).reshape(-1, 3)

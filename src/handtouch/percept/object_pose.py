@@ -225,9 +225,9 @@ class PoseSampler:
         for iteration in range(iterations + 1):
             slope, information = self._normal_equations(poses, evidence)
             if iteration < iterations:
-                change: FloatArray = -np.linalg.solve(information, slope[..., None])[..., 0]
+                change: FloatArray = np.asarray(-np.linalg.solve(information, slope[..., None])[..., 0])
                 poses = poses.perturbed(_limited(change))
-        covariance: FloatArray = np.linalg.inv(information)
+        covariance: FloatArray = np.asarray(np.linalg.inv(information))
         found = _Proposals(poses, covariance, self.log_likelihood(poses, evidence))
         score = found.log_likelihood + 0.5 * np.linalg.slogdet(covariance)[1]
         kept = score > score.max() - _MAX_LOG_GAP
@@ -289,7 +289,8 @@ class PoseSampler:
         near = np.einsum("ski,ski->sk", apart, np.linalg.solve(both, apart[..., None])[..., 0])
         _, cluster = connected_components(near < _MERGED_DISTANCE2, directed=False)
         of_sample = cluster[responsible]
-        self._hypothesis_weight = np.bincount(of_sample, self.weights)[of_sample] + _MIN_SHARE
+        shares: FloatArray = np.asarray(np.bincount(of_sample, self.weights)[of_sample] + _MIN_SHARE)
+        self._hypothesis_weight = shares
         found = []
         for number in np.unique(of_sample):
             rows = np.flatnonzero(of_sample == number)

@@ -248,7 +248,7 @@ def _distance_from_corners(corners: FloatArray, points: FloatArray, spacing_m: f
     from scipy.spatial import cKDTree  # only here, as few objects are meshes
 
     samples, owner = _sample_triangles(corners, spacing_m)
-    _, nearest = cKDTree(samples).query(points, _NEAREST)
+    nearest = np.asarray(cKDTree(samples).query(points, _NEAREST)[1])
     squares = [
         squared_distance_from_triangles(*(corners[owner[of]] - points[:, None]).transpose(1, 0, 2))
         for of in nearest.T

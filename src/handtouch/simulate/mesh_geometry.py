@@ -87,7 +87,7 @@ class MeshElements:
     @cached_property
     def slopes(self) -> FloatArray:
         """(t, 2, 2), gradients of both `fractions` in the facets' planes [1/m]."""
-        return np.einsum("tak,tkf->tfa", self.gradients, self.fractions[self.triangles])
+        return np.asarray(np.einsum("tak,tkf->tfa", self.gradients, self.fractions[self.triangles]))
 
     @cached_property
     def aspect(self) -> float:
@@ -105,7 +105,7 @@ class MeshElements:
     def normals(self) -> FloatArray:
         """(points, 3), outward unit normals."""
         normals = self.at_points(self.facet_normals)
-        return normals / np.linalg.norm(normals, axis=1)[:, None]
+        return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])
 
     def at_points(self, values: FloatArray) -> FloatArray:
         """Return means (points, ...) of values (t, ...) of the triangles around each point, by area."""
@@ -132,7 +132,7 @@ class MeshElements:
     def values_at(self, fractions: FloatArray, values: FloatArray) -> FloatArray:
         """Return values (n, ...) of potentials (points, ...) at fractions (n, 2) of the pad."""
         triangle, weights = self.locate(fractions)
-        return np.einsum("nk,nk...->n...", weights, values[self.triangles[triangle]])
+        return np.asarray(np.einsum("nk,nk...->n...", weights, values[self.triangles[triangle]]))
 
     @cached_property
     def _flat_corners(self) -> tuple[FloatArray, FloatArray]:
@@ -141,7 +141,7 @@ class MeshElements:
         corners = self.fractions[self.triangles]
         sides = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
         sides[np.linalg.det(sides) == 0] = np.eye(2)  # in a corner, where all points have one fraction
-        return corners[:, 0], np.linalg.inv(sides)
+        return corners[:, 0], np.asarray(np.linalg.inv(sides))
 
     @cached_property
     def _fraction_tree(self) -> Any:
@@ -230,7 +230,7 @@ class SimulatedMesh(SimulatedSurface):
 
     def point(self, s_m: float, phi: float) -> FloatArray:
         """Return a position (3,) [m] in the pad's frame."""
-        return self._points_at(np.array([[s_m / self.length_m, phi / self.arc]]))[0]
+        return np.asarray(self._points_at(np.array([[s_m / self.length_m, phi / self.arc]]))[0])
 
     def _points_at(self, fractions: FloatArray) -> FloatArray:
         return self.elements.values_at(fractions, self.elements.points)
@@ -272,7 +272,7 @@ class SimulatedMesh(SimulatedSurface):
 
     def scale_at(self, position: FloatArray) -> FloatArray:
         """Return metres on the surface (n,) per metre of `plane` at fractions of the pad (2, n)."""
-        return self._metres(position)[0] / self.length_m
+        return np.asarray(self._metres(position)[0] / self.length_m)
 
     def plane(self, position: ArrayLike) -> FloatArray:
         """Return the places (2, ...) [m] of fractions of the pad (2, ...) in its conformal image, of the

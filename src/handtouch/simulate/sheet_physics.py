@@ -182,8 +182,8 @@ class SheetStates:
         columns[0], columns[1], columns[2] = dt_s, load_n, warmer_k
         excited, apparent_n = np.empty(count, np.uint8), np.empty(count)
         excited[:] = is_excited
-        dt, load, warmer = (column.data for column in columns)
-        self._stage.advance(sheets.data, dt, load, excited.data, warmer, apparent_n.data)
+        memory: list[Any] = [array.data for array in (sheets, *columns[:2], excited, columns[2], apparent_n)]
+        self._stage.advance(*memory)
         return apparent_n
 
 

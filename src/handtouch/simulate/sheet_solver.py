@@ -21,7 +21,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,8 +185,8 @@ class SheetMapBank:
             table[..., : len(sheet.table) - 1] = np.moveaxis(sheet.table[:-1], 0, -1)
             table[..., -1] = sheet.table[-1]
         arrays = tables, _SHARE_BREAKS, _VALUES, _SLOPES, np.zeros((4, _TABLE_DEGREE + 1))
-        flat, *others = (array.reshape(-1).data for array in arrays)
-        self._tables = NodeTables(flat, shape[0], self._rows, *others)
+        memory: list[Any] = [array.reshape(-1).data for array in arrays]
+        self._tables = NodeTables(memory[0], shape[0], self._rows, *memory[1:])
 
     def look_up(
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray
@@ -214,10 +214,10 @@ class SheetMapBank:
         self, sheet: NDArray[np.intp], s: FloatArray, phi: FloatArray, slopes: FloatArray
     ) -> FloatArray:
         found = np.empty((self._rows, len(sheet)))
-        places = (np.ascontiguousarray(axis, np.float64).data for axis in (s, phi))
-        self._tables.read(
-            np.ascontiguousarray(sheet).data, *places, found.reshape(-1).data, slopes.reshape(-1).data
-        )
+        places = (np.ascontiguousarray(axis, np.float64) for axis in (s, phi))
+        arrays = np.ascontiguousarray(sheet), *places, found.reshape(-1), slopes.reshape(-1)
+        memory: list[Any] = [array.data for array in arrays]
+        self._tables.read(*memory)
         return found
 
 

@@ -33,8 +33,6 @@ from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.config import Deployment
 from handtouch.core.least_threshold import LevelScatter, least_begin_counts
 from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
-from handtouch.field.model import FractionModel
-from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_limits, part_stds
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import (
@@ -107,7 +105,7 @@ class SupervisorWorker:
         self, deployment: Deployment, store: StoreClient, diagnostics: DeploymentDiagnostics | None = None
     ) -> None:
         entries = deployment.pads
-        models: dict[object, tuple[ElectrodeNetwork, tuple[FractionModel, ...], tuple[float, ...]]] = {}
+        models: dict[object, tuple[Any, ...]] = {}
         self._pads = []
         most = max(len(pad.electrode_names) for _, pad in entries)
         self._ampere_per_count = np.zeros((len(entries), most))

@@ -23,7 +23,15 @@ Matrix3 = tuple[float, float, float, float, float, float, float, float, float]
 List3 = Annotated[list[float], Vector3]
 List9 = Annotated[list[float], Matrix3]
 List4 = Annotated[list[float], tuple[float, float, float, float]]
-List36 = Annotated[list[float], tuple[(float,) * 36]]
+Matrix6 = tuple[
+    float, float, float, float, float, float,
+    float, float, float, float, float, float,
+    float, float, float, float, float, float,
+    float, float, float, float, float, float,
+    float, float, float, float, float, float,
+    float, float, float, float, float, float
+]  # fmt: skip
+List36 = Annotated[list[float], Matrix6]
 """Lists of so many numbers, in a map inside of a payload"""
 EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
 ContactEvent = Literal["begin", "update", "end"]

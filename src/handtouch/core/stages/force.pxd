@@ -47,5 +47,5 @@ cdef double sheet_ohm_per_square(PadLaw law) noexcept
 cdef double whole_factor(PadLaw law, double total_a) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t)
 cdef double series_resistance(PadLaw law, double[::1] currents, Py_ssize_t first, Py_ssize_t electrodes) noexcept
-@cython.locals(k=Py_ssize_t)
+@cython.locals(k=Py_ssize_t, square=double, level=double)
 cdef double find_log_x2(StackTable stack, double factor) noexcept

@@ -454,6 +454,6 @@ def find_log_x2(stack: StackTable, factor: float) -> float:
         k = stack.inverse_intervals - 1
     t = place - k
     k *= 4
-    return ((stack.inverse[k] * t + stack.inverse[k + 1]) * t + stack.inverse[k + 2]) * t + stack.inverse[
-        k + 3
-    ]
+    square: float = stack.inverse[k] * t + stack.inverse[k + 1]
+    level: float = (square * t + stack.inverse[k + 2]) * t + stack.inverse[k + 3]
+    return level

@@ -71,7 +71,8 @@ class ContactTransforms:
     def __init__(self, hands: list[str], robots: RobotModels | None, state: TickState) -> None:
         n, memory = len(hands), state.memory
         self.pads, self.held = n, state
-        self.joints_at, self.used_joints, self.any_requested = _no_joints, [], False
+        used_joints: list[Any] = []
+        self.joints_at, self.used_joints, self.any_requested = _NO_JOINTS, used_joints, False
         self.requested = np.zeros(n, dtype=np.bool_)
         self.hands = [HandFrames(robots, number) for number in range(len(robots.hands))] if robots else []
         self.published_values = np.full((n, _ROW), np.nan, np.float32)
@@ -80,10 +81,8 @@ class ContactTransforms:
         self.on_link = view_rows(np.zeros(1, FRAME_ROW), FRAME_ROW)
         self.covariance = view_memory(np.zeros(9))
         self.contacts, self.parts = view_rows(state.values, VALUE_ROW), view_rows(state.parts, PART_ROW)
-        frames, parts = (
-            view_rows(state.palm_values, CONTACT_FRAMES),
-            view_rows(state.part_frames, PART_FRAMES),
-        )
+        frames: Any = view_rows(state.palm_values, CONTACT_FRAMES)
+        parts: Any = view_rows(state.part_frames, PART_FRAMES)
         self.palm, self.base = frames["palm"], frames["base"]
         self.parts_palm, self.parts_base = parts["palm"], parts["base"]
         within_m, number_of_hand = np.zeros(n), {hand: k for k, hand in enumerate(dict.fromkeys(hands))}
@@ -222,6 +221,9 @@ def _no_joints(hand: str, t_ns: int) -> JointSnapshot | None:  # noqa: ARG001
     return None
 
 
+_NO_JOINTS: Any = _no_joints
+
+
 def _begin_contact(frames: ContactTransforms, pad: int) -> None:
     if frames.palm_requested[pad] or frames.base_requested[pad]:
         frames.pending[pad] = 1
@@ -254,9 +256,7 @@ def _publish_pad(frames: ContactTransforms, pad: int) -> None:
     frames.published[row + _AGE] = frames.values[row + _AGE]
 
 
-def _transform_contact(
-    frames: ContactTransforms, hand: HandFrames, pad: int, ages_s: memoryview[float]
-) -> None:
+def _transform_contact(frames: ContactTransforms, hand: HandFrames, pad: int, ages_s: FloatArray) -> None:
     """Transform a contact to the palm and, if requested, to the base."""
     oldest_s = _transform(frames, hand, pad, False, ages_s)
     if frames.base_requested[pad]:
@@ -268,7 +268,7 @@ def _transform_contact(
 
 
 def _transform(
-    frames: ContactTransforms, hand: HandFrames, pad: int, in_base: bool, ages_s: memoryview[float]
+    frames: ContactTransforms, hand: HandFrames, pad: int, in_base: bool, ages_s: FloatArray
 ) -> float:
     """Transform a contact to one frame; return the age of the oldest joint that its pose depends on."""
     link = pad - hand.first

@@ -79,7 +79,7 @@ cdef void _add_elongation(
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
 cdef void _add_second_derivatives(
     Whitening whitening, Py_ssize_t states, double[::1] weight, double total, double std) noexcept
-@cython.locals(k=Py_ssize_t)
+@cython.locals(k=Py_ssize_t, shift=double)
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t)
 cdef void _add_square(double[::1] matrix, double[::1] vector, Py_ssize_t n) noexcept

@@ -485,7 +485,8 @@ def overhang(pad: PadTolerances, distance_m: float) -> float:
     k = int(place)
     if k > len(pad.overhangs) - 2:
         return 0.0
-    return pad.overhangs[k] + (place - k) * (pad.overhangs[k + 1] - pad.overhangs[k])
+    shift: float = pad.overhangs[k] + (place - k) * (pad.overhangs[k + 1] - pad.overhangs[k])
+    return shift
 
 
 def _add_square(matrix: memoryview[float], vector: memoryview[float], n: int) -> None:

@@ -13,7 +13,8 @@ cdef class HistoryStage:
     cpdef advance(self, Py_ssize_t[::1] sheets, double[::1] dt_s, double[::1] load_n, unsigned char[::1] excited,
                   double[::1] warmer_k, double[::1] apparent_n)
 
-@cython.locals(load=double, effective=double, crept=double, first=Py_ssize_t, i=Py_ssize_t, part=double)
+@cython.locals(load=double, effective=double, crept=double, first=Py_ssize_t, i=Py_ssize_t, part=double,
+               apparent=double)
 cdef double _advance(HistoryStage stage, Py_ssize_t sheet, double dt_s, double load_n, bint excited,
                      double warmer_k) noexcept
 @cython.locals(first=Py_ssize_t, i=Py_ssize_t, back=double, flows=bint, pressed=bint, speed=double, change=double,
@@ -24,5 +25,5 @@ cdef double _sum_back(HistoryStage stage, Py_ssize_t first) noexcept
 @cython.locals(first=Py_ssize_t, points='double[::1]', last=Py_ssize_t, swing=double, is_continued=bint,
                is_wiped_out=bint, at=Py_ssize_t, total=double)
 cdef double _apply_loops(HistoryStage stage, Py_ssize_t sheet, double load_n) noexcept
-@cython.locals(i=Py_ssize_t, swing=double, beyond=double)
+@cython.locals(i=Py_ssize_t, swing=double, beyond=double, reading=double)
 cdef double _swing(HistoryStage stage, double high_n, double low_n) noexcept

@@ -57,7 +57,8 @@ def _advance(
         part = min(part, effective)  # a release is abrupt
         stage.creep_n[first + i] = part
         crept += stage.weights[i] * part
-    return (stage.instant * effective + crept) * (1.0 + stage.gain_per_k * warmer_k)
+    apparent: float = (stage.instant * effective + crept) * (1.0 + stage.gain_per_k * warmer_k)
+    return apparent
 
 
 def _adapt(stage: HistoryStage, sheet: int, dt_s: float, load_n: float, excited: int) -> float:
@@ -129,4 +130,5 @@ def _swing(stage: HistoryStage, high_n: float, low_n: float) -> float:
     for i in range(stage.plays):
         if swing > stage.plays_n[i]:
             beyond += swing - stage.plays_n[i]
-    return stage.linear * swing + stage.play_weight * beyond
+    reading: float = stage.linear * swing + stage.play_weight * beyond
+    return reading
