@@ -129,7 +129,6 @@ class Task:
     number: int
     each: int
     learns: bool
-    family: Family
 
 
 def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
@@ -161,7 +160,7 @@ def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tup
 
 def play(task: Task) -> dict[str, Estimates]:
     """Return estimates of position and of force of a hand, in each state."""
-    seed = task.family.seed(task.number)
+    seed = Family.REPORTING.seed(task.number)
     drawn, builder = task.disturbance.world.draw(seed), WORLD.draw(seed)
     deployment = builder.describe(load(shipped.path("utah_mit.toml")))
     model = build_pad_model(deployment)
@@ -253,25 +252,21 @@ def main() -> None:
     parser.add_argument(
         "--only", default="", help="profiles, disturbances, or those named so (keeps no page)"
     )
-    parser.add_argument("--tuning", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.disturbed, asked.each = 1, 1, 1
-    family = Family.TUNING if asked.tuning else Family.REPORTING
     named = "" if asked.only in ("profiles", "disturbances") else asked.only
-    quick = asked.quick or asked.tuning or bool(named)
+    quick = asked.quick or bool(named)
     if asked.only in ("", "profiles"):
-        tasks = [
-            Task(DISTURBANCES[0], SHAPES, number, asked.each, True, family) for number in range(asked.hands)
-        ]
+        tasks = [Task(DISTURBANCES[0], SHAPES, number, asked.each, True) for number in range(asked.hands)]
         made = played(tasks, asked.processes)
         report = Report(quick, "profiles", hands=asked.hands, touches_of_a_pad_in_a_cell=asked.each)
         state_tables(report, {q: concatenate([one[q] for one in made]) for q in ("position", "force")})
         report.keep()
     if asked.only != "profiles":
         tasks = [
-            Task(one, ROUND, number, asked.each, one.learns, family)
+            Task(one, ROUND, number, asked.each, one.learns)
             for one in DISTURBANCES
             if named in one.name
             for number in range(asked.disturbed)

@@ -61,10 +61,10 @@ def draw_presses(links: list[str], count: int, seed: int) -> tuple[ScenarioTouch
     )
 
 
-def play(task: tuple[int, int, Family]) -> tuple[FloatArray, NDArray[np.str_]]:
+def play(task: tuple[int, int]) -> tuple[FloatArray, NDArray[np.str_]]:
     """Return columns (n, COLUMNS) of the presses of a hand, and their pads: number, presses of each pad."""
-    number, count, family = task
-    drawn = WORLD.draw(family.seed(number))
+    number, count = task
+    drawn = WORLD.draw(Family.REPORTING.seed(number))
     deployment = drawn.describe(load(shipped.path("utah_mit.toml")))
     daemon = deployment.daemon.model_copy(update={"sync_period_ms": PERIOD_MS})
     deployment = deployment.model_copy(update={"daemon": daemon})
@@ -110,13 +110,11 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--hands", type=int, default=5)
     parser.add_argument("--presses", type=int, default=134, help="of each pad of a hand")
-    parser.add_argument("--tuning", action="store_true", help="seeds of the tuning family; keeps no page")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.presses = 1, 4
-    family = Family.TUNING if asked.tuning else Family.REPORTING
-    tasks = [(number, asked.presses, family) for number in range(asked.hands)]
+    tasks = [(number, asked.presses) for number in range(asked.hands)]
     with ProcessPoolExecutor(asked.processes) as pool:
         made = []
         for task, result in zip(tasks, pool.map(play, tasks), strict=True):
@@ -142,7 +140,7 @@ def main() -> None:
                 "interval or bound true": ClusterShare.of_mask(column["true"][stated] > 0, pads[stated]),
             }
         )
-    report = Report(asked.quick or asked.tuning, hands=asked.hands, presses_of_a_pad=asked.presses)
+    report = Report(asked.quick, hands=asked.hands, presses_of_a_pad=asked.presses)
     report.table("Presses", rows)
     every = rows[-1]
     report.limit("presses whose contact ended or lost a number", every["ended or unknown"], 0)
