@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,8 @@ def test_an_old_frame_shows_nothing_of_any_pad() -> None:
     found = shown(features, features.of(HandArrays(touching()).as_old(), now_ns=T_NS + 10**10))
     assert {name for name, value in found.items() if value} == {f"{link}.age_s" for link in LINKS}
     assert found[f"{LINKS[0]}.age_s"] == MAX_AGE_S
+    gone = features.of(SimpleNamespace(alive=False))  # a hand whose daemon is gone has no columns
+    assert shown(features, gone) == found
 
 
 def test_the_layout_is_the_same_from_a_frame_and_from_a_window() -> None:

@@ -104,9 +104,11 @@ class TouchFeatures:
 
         `now_ns`: time for the ages, on the clock of `sample_ns`; default: the source's own (`Hand.now_ns`,
         the SYNC of a frame, the newest sample of a `TactileReading`). `links`: of the source's pads, where it
-        doesn't have them itself: `TactileSensor.links`. Raises LookupError for a link that the source doesn't
-        have, and for a column that isn't published.
+        doesn't have them itself: `TactileSensor.links`. A `Hand` that isn't alive has no pad that is sampled.
+        Raises LookupError for a link that the source doesn't have, and for a column that isn't published.
         """
+        if not getattr(source, "alive", True):
+            return self._unsampled()
         read = _reader(source)
         rows = _rows_of(source.links if links is None else links, self.links)
         state, sample_ns = read("state")[..., rows], read("sample_ns")[..., rows]
@@ -134,6 +136,11 @@ class TouchFeatures:
         found = self.of(window)[-samples:] if len(window) else filled[:0]
         filled[samples - len(found) :] = found
         return filled
+
+    def _unsampled(self) -> FloatArray:
+        values = np.zeros((len(self.links), len(self.features)), np.float32)
+        values[:, -1] = MAX_AGE_S
+        return values.ravel()
 
     def _positions(
         self, read: Callable[[str], NDArray[Any]], rows: list[int], touched: NDArray[np.bool_]
