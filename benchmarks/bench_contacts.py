@@ -160,8 +160,8 @@ def draw_touches(task: Task, links: Sequence[str], count: int, seed: int) -> tup
 
 def play(task: Task) -> dict[str, Estimates]:
     """Return estimates of position and of force of a hand, in each state."""
-    seed = Family.REPORTING.seed(task.number)
-    drawn, builder = task.disturbance.world.draw(seed), WORLD.draw(seed)
+    drawn = task.disturbance.world.draw(Family.REPORTING.seed(task.number))
+    builder = WORLD.draw(Family.REPORTING.seed(task.number))
     deployment = builder.describe(load(shipped.path("utah_mit.toml")))
     model = build_pad_model(deployment)
     first = WARM_UP + (QUIET if task.disturbance.is_noise else 0)

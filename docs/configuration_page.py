@@ -291,7 +291,7 @@ def _has_rows(model: type[BaseModel]) -> bool:
 
 def _sections(models: Mapping[str, type[BaseModel]], prefix: str, lists: set[str]) -> Iterator[str]:
     for name, model in models.items():
-        if name in SAME or not _has_rows(model):
+        if name in SAME or not (name or _has_rows(model)):
             continue
         header = name.replace("*", "NAME")
         title = TITLES.get(name) or (f"[[{header}]]" if name in lists else f"[{header}]")

@@ -179,7 +179,7 @@ ERRORS = {
     ),
     "wrong shape": (
         ('kind = "cylinder"', 'kind = "tube"'),
-        THUMB + 'surface.kind = "tube": must be "cone", "cylinder", "outline",',
+        THUMB + 'surface.kind = "tube": must be "cone", "cylinder", "mesh", "outline",',
     ),
     "wrong option": (
         ('channel = "can0"', 'channel = "can0"\noptions = { fd = [1] }'),

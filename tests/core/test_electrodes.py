@@ -86,7 +86,7 @@ def test_a_state_names_its_number_of_channels_unless_it_is_four() -> None:
             {"end": THREE_ARCS["end"], "right": THREE_ARCS["right"], "left": THREE_ARCS["left"]},
             "left must follow right",
         ),
-        ({**THREE_ARCS, "right": (28.9812, 200.0)}, "outline is 56.549 mm long"),
+        ({**THREE_ARCS, "right": (28.9812, 200.0)}, "edge is 56.549 mm long"),
     ],
 )
 def test_impossible_arcs_are_refused(arcs: dict[str, tuple[float, float]], message: str) -> None:

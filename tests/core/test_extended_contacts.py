@@ -99,7 +99,7 @@ def shares_of_true_forces(tilt_std: float) -> list[float]:
         patch[2], patch[3] = rng.uniform(0, np.pi, count), number
         force_n = np.exp(rng.uniform(0.0, np.log(20.0), count))
         position = rng.uniform(0.15, 0.85, (2, count))
-        currents, _ = hand.solve_contacts(np.zeros(count, np.intp), position, patch, force_n)
+        currents = hand.solve_contacts(np.zeros(count, np.intp), position, patch, force_n)
         found = solve(model, currents)
         fitted = found["force_status"][:, 0] == ForceEstimateStatus.VALID
         off_n = found["force_n"][:, 0] - force_n

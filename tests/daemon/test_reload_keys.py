@@ -20,8 +20,9 @@ from handtouch.daemon.table_cache import build_pad_model
 from tests.deployments import CYLINDER, deployment_text, pad_text
 from tests.record.conftest import PERIOD_NS, SESSION, CollectingSink, Hand
 
-APPLIED_WITHOUT_PADS = {"daemon", "scene"}
-"""tables whose changed keys are applied by other owners than the pads' model: log level, scenes, sampling"""
+APPLIED_WITHOUT_PADS = {"daemon", "scene", "object.ball", "hand h"}
+"""tables whose changed keys are applied by other owners than the pads' model: log level, scenes, sampling,
+known objects"""
 
 
 VALUES: dict[str, object] = {
@@ -69,7 +70,12 @@ def changed(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 RICH = deployment_text(
     pad_text("plane", 1, extra="[hand.pad.touch]\nbegin_threshold_n = 0.2\n"), pad_text("round", 2, CYLINDER)
-).replace("[touch]", "[sheet.s.behaviour]\ngain_std = 0.2\n\n[touch]", 1)
+).replace(
+    "[touch]",
+    "[sheet.s.behaviour]\ngain_std = 0.2\n\n"
+    '[object.ball]\nshape = { kind = "sphere", diameter_mm = 50.0 }\n\n[touch]',
+    1,
+)
 
 
 def test_every_key_is_applied_or_needs_a_restart() -> None:

@@ -104,9 +104,10 @@ def test_a_hand_that_turns_over_once_a_second_has_no_contact_but_the_touch(rig: 
             elif message.link != TOUCHED:
                 others.append(message.link)
             elif message.event == "end":  # without samples, on a machine that is too busy for a while
+                assert message.end_reason == "stale"
                 begin_ns = 0
             else:
                 begin_ns = begin_ns or message.t_ns
     assert others == []
     ampere_per_count = 10e-3 / 32767
-    assert np.std(currents) / ampere_per_count < 0.75 * weight_std_counts(rig)
+    assert np.std(currents) / ampere_per_count < weight_std_counts(rig)

@@ -168,7 +168,7 @@ def test_of_too_many_nested_swings_the_smallest_is_forgotten() -> None:
     for load in nested:
         points.apply(load)
     returned, fresh = points.apply(nested[100]), Hysteresis(loops)
-    for load in (*nested[:99], nested[100]):
+    for load in nested[:101]:
         expected = fresh.apply(load)
     assert returned == pytest.approx(expected, abs=1e-9)
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -41,7 +41,7 @@ def begin_samples(begin_debounce_ns: int, period_ns: int) -> int:
 def least_begin_counts(scatter_counts: float, samples_per_s: float) -> float:
     """Return the least sum of channels at which a contact may begin, by the standard deviation of the mean of
     as many samples as begin it; NaN if that is unknown."""
-    return float(-ndtri(1 / (samples_per_s * FALSE_CONTACT_PERIOD_S)) * scatter_counts)
+    return -NormalDist().inv_cdf(1 / (samples_per_s * FALSE_CONTACT_PERIOD_S)) * scatter_counts
 
 
 def level_scatter(levels: FloatArray, samples: int) -> float:

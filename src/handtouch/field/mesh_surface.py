@@ -73,7 +73,7 @@ class MeshSurface(Surface):
         "pose of the file's frame: none is needed if it is drawn in that of the link. A recording has a "
         "data: URL in its place",
         is_file=True,
-        example="tip.stl",
+        example="fingertip.stl",
     )
     corner_x_m: tuple[float, ...] = surface_key(
         "corner_x_mm",
@@ -81,21 +81,21 @@ class MeshSurface(Surface):
         "counter-clockwise seen from outside; moved to the nearest point of the edge",
         above=None,
         is_list=True,
-        example=[-10.0, 10.0, 10.0, -10.0],
+        example=[5.2, 22.8, 22.8, 5.2],
     )
     corner_y_m: tuple[float, ...] = surface_key(
         "corner_y_mm",
         "y of the same points",
         above=None,
         is_list=True,
-        example=[-8.0, -8.0, 8.0, 8.0],
+        example=[-6.0, -4.8, 4.8, 6.0],
     )
     corner_z_m: tuple[float, ...] = surface_key(
         "corner_z_mm",
         "z of the same points",
         above=None,
         is_list=True,
-        example=[0.0, 0.0, 0.0, 0.0],
+        example=[3.0, 3.0, 3.0, 3.0],
     )
 
     @classmethod
