@@ -40,7 +40,7 @@ class TareResult(TypedDict):
     begin_threshold_n: NotRequired[float]
     """in the deployment"""
     least_begin_threshold_n: NotRequired[float | None]
-    """least with one false contact in 100 hours, by the noise of this second and the drift so far"""
+    """lower bound of it for one false contact in 100 hours, by the noise of this second and drift so far"""
 
 
 class ActiveScene(TypedDict):

@@ -143,8 +143,8 @@ class Health:
     diagnoses: Annotated[tuple[dict[str, Any], ...], tuple[Diagnosis, ...]] = ()
     """active diagnoses"""
     least_begin_threshold_n: float | None = None
-    """least `begin_threshold_n` with one false contact in 100 hours, by noise and drift of the pad while
-    untouched; absent in its first minute"""
+    """lower bound of the `begin_threshold_n` with one false contact in 100 hours, by noise and drift of the
+    pad while untouched; absent in its first minute"""
 
 
 @dataclass(frozen=True, slots=True)
