@@ -171,7 +171,7 @@ def test_a_ros_program_receives_wrenches_and_moves_the_palm_frame(
         assert fine["handtouch: bus can0"] == [0, "active"]
         assert rig.end("run") == 0
         ended = next_line(
-            remote, "diagnostics", lambda line: line["status"].get("handtouch: daemon", [0])[0] == 2
+            remote, "diagnostics", lambda line: line["status"].get("handtouch: daemon") == [2, "disconnected"]
         )
         assert ended["status"] == {"handtouch: daemon": [2, "disconnected"]}
         bridge.terminate()
