@@ -316,6 +316,19 @@ def test_a_pad_that_falls_silent_while_touched_is_unknown_once_until_it_is_sampl
     assert hand.forces_n("") == [0.0]
 
 
+def test_a_sample_that_was_unknown_never_counts_again() -> None:
+    """A pad that changes between lost and sampled without a newer sample has one wrench of NaN."""
+    hand = RelayedHand()
+    hand.tick(state=(0, 0, 0), contact_id=(0, 0, 0))
+    assert hand.forces_n("index_tip/") == [0.0]
+    newest_ns = (10**10 + 10_000_000,) * 3
+    for state in (PadState.STALE, 0) * 3:
+        hand.tick(state=(0, state, 0), contact_id=(0, 0, 0), sample_ns=newest_ns)
+    assert np.array_equal(hand.forces_n("index_tip/"), [math.nan], equal_nan=True)
+    hand.tick(state=(0, 0, 0), contact_id=(0, 0, 0))
+    assert hand.forces_n("index_tip/") == [0.0]
+
+
 def test_the_first_missing_sample_of_a_contact_is_unknown() -> None:
     hand = RelayedHand()
     hand.tick(HELD)
