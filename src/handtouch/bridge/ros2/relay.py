@@ -307,7 +307,7 @@ class _HandRelay:
         known_ns = self._known_ns.pop(link, None)
         if known_ns is None:
             return
-        self._lost_ns[link] = max(known_ns, t_ns)  # what is unknown stays so until a newer sample
+        self._lost_ns[link] = t_ns = max(known_ns, t_ns)  # what is unknown stays so until a newer sample
         frame = contact.frame if (contact := self._unknown.get(link)) else link
         self._writer_of(link).write(conversion.encode_plain_wrench(t_ns, frame, math.nan, self._stamper))
 
