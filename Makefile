@@ -71,6 +71,10 @@ demo: $(VENV)/.run $(if $(VIEW),$(VENV)/.view) ## run a simulated hand, the daem
 examples: $(VENV)/.dev ## run examples/, each a control loop with a simulated gripper; one minute
 	@$(BIN)/python examples/run_all.py
 
+.PHONY: bolt
+bolt: $(VENV)/.dev $(VENV)/.core ## find a bolt by touch and start it in a hole, with a simulated hand; a minute
+	@$(BIN)/python examples/start_bolt.py $(ARGS)
+
 # --- test
 
 .PHONY: test check others lint types unit fastest coverage socketcan docs tables wiring

@@ -9,7 +9,8 @@ calibration by 56 more such contacts of each pad.
 
 *Disturbances*: evenly pressed round contacts of the same hands with one property more, or another one, which
 the file doesn't state; leads and gains also after calibration by 56 such contacts. Errors and
-deviations in mm; intervals of shares by pads.
+deviations in mm; intervals of shares by pads. The oracle knows the distributions of the world and of its
+patches, but no value; of disturbances nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -25,21 +26,29 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.bench_worlds import DRAWN_MORE, DRAWN_PER_LEARNT, learn
+from benchmarks.bench_worlds import (
+    DRAWN_MORE,
+    DRAWN_PER_LEARNT,
+    contact_noise_a,
+    learn,
+    true_contacts,
+)
 from benchmarks.hand_touches import (
     REST_S,
+    SAMPLE_S,
     STEP_S,
     TOUCH_S,
     TouchReadings,
     compare,
 )
-from benchmarks.oracle import PadOracle
+from benchmarks.oracle import PadOracle, Patches
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import ClusterShare, Estimates, EstimateScore, concatenate
 from handtouch.config import load, shipped
+from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.contact_patch import PROFILES
-from handtouch.simulate.faults import GainStep
+from handtouch.simulate.faults import FAULTS, Fault
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -81,8 +90,8 @@ class Disturbance:
 
     name: str
     world: World = WORLD
-    gain_step: float = 1.0
-    """Factor of one channel's gain of each pad."""
+    fault: Mapping[str, Any] = field(default_factory=dict)
+    """Of one electrode or channel of each pad, as in a scenario file."""
     beside: float = 0.0
     """Share of the force that presses right beside the touch, as a film of water might conduct."""
     over_edge: bool = False
@@ -113,9 +122,15 @@ DISTURBANCES = (
     ),
     Disturbance("crosstalk of 1 %", electronics(crosstalk=Fixed(0.01))),
     *(
-        Disturbance(f"one gain wrong by {100 * step:g} %", gain_step=1 + step, learns=True)
+        Disturbance(
+            f"one gain wrong by {100 * step:g} %",
+            fault={"kind": "gain_step", "factor": 1 + step},
+            learns=True,
+        )
         for step in (0.05, 0.1)
     ),
+    Disturbance("one channel dead", fault={"kind": "gain_step", "factor": 1e-6}),
+    Disturbance("one electrode unplugged", fault={"kind": "dead_electrode"}),
     Disturbance("water beside the contact, 10 %", beside=0.19),
 )
 
@@ -170,26 +185,40 @@ def play(task: Task) -> dict[str, Estimates]:
     others = range(numbers.stop, numbers.stop + more)
     stimulus = Scenario(touch=draw_touches(task, model.links, others.stop, drawn.seed))
     rng = np.random.default_rng((drawn.seed, 12))
-    step = task.disturbance.gain_step
-    faults = [
-        GainStep(link=link, from_s=0.0, electrode=("x0", "xa", "y0", "yb")[rng.integers(4)], factor=step)
-        for link in model.links
-        if step != 1
-    ]
+    fault, faults = task.disturbance.fault, list[Fault]()
+    for link in model.links if fault else ():
+        electrode = SIDE_ELECTRODES[rng.integers(4)]
+        table = {"link": link, "from_s": 0.0, "electrode": electrode, **fault}
+        faults.append(FAULTS[fault["kind"]].model_validate(table))
     hand = VirtualHand(deployment, stimulus, drawn, faults=faults)
     readings = TouchReadings.of_hand(hand, deployment, numbers)
+    learnt_at = {
+        (k, truth.link): truth
+        for k in others
+        for truth in hand.truth(REST_S + k * STEP_S + SAMPLE_S)
+    }  # fmt: skip
     found: dict[str, list[Estimates]] = {"position": [], "force": []}
     for state in (CONFIGURED, LEARNED) if task.learns else (CONFIGURED,):
+        given: list[list[int]] = [[]] * model.size
         if state == LEARNED:
             for row in range(model.size):
-                if calibration := learn(hand, deployment, model, row, others, (LEARNT,))[0].calibration:
-                    model.set_calibration(row, calibration)
+                learnt = learn(hand, deployment, model, row, others, (LEARNT,))[0]
+                given[row] = learnt.touches
+                if learnt.calibration:
+                    model.set_calibration(row, learnt.calibration)
         contacts = readings.contacts(model, deployment)
         for row, (name, pad) in enumerate(deployment.pads):
             keys = [(k, pad.link) for k in numbers if (k, pad.link) in readings.truths]
             pairs = [(contacts.get(key), readings.truths[key]) for key in keys]
             labels = {"state": state, "pad": f"{task.number}/{pad.link}"}
-            oracle = PadOracle.build(drawn, deployment, name, pad, model.noise_a[row])
+            radius_m = 1e-3 * deployment.sheets[pad.sheet].contact_radius_mm
+            forms = [(one["profile"], one["elongation"]) for one in task.shapes.values()]
+            oracle = PadOracle.build(
+                drawn, deployment, name, pad, model.noise_a[row], Patches(hand, row, radius_m, forms)
+            )
+            if given[row]:
+                before = true_contacts(learnt_at, pad.link, given[row])
+                oracle = oracle.with_contacts(before, contact_noise_a(model, row))
             position, force = compare(pairs, oracle, labels)
             shapes = list(task.shapes)
             cells = {
@@ -291,14 +320,15 @@ def disturbance_rows(tasks: Sequence[Task], made: Sequence[dict[str, Estimates]]
     """Return a row for each disturbance and state."""
     rows = []
     for name in dict.fromkeys(task.disturbance.name for task in tasks):
-        of_row = [
-            one["position"] for task, one in zip(tasks, made, strict=True) if task.disturbance.name == name
-        ]
-        every = concatenate(of_row)
-        rows += [
-            {"case": f"{name}, {state}"} | row_of(every.where(every.columns["state"] == state))
-            for state in dict.fromkeys(every.columns["state"].tolist())
-        ]
+        of_row = [one for task, one in zip(tasks, made, strict=True) if task.disturbance.name == name]
+        position, force = (concatenate([one[what] for one in of_row]) for what in ("position", "force"))
+        for state in dict.fromkeys(position.columns["state"].tolist()):
+            own = row_of(force.where(force.columns["state"] == state), 1.0)
+            rows.append(
+                {"case": f"{name}, {state}"}
+                | row_of(position.where(position.columns["state"] == state))
+                | {f"force: {column}": own[column] for column in ("valid, %", "in 95 %", "> 5 sigma, %")}
+            )
     return rows
 
 

@@ -47,13 +47,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.event_score import EventScore
 from benchmarks.grasp_run import PARTS, Served, against, at_best, drawn_world, served
 from handtouch.config import (
     Deployment,
     load,
     shipped,
 )
-from handtouch.simulate.grasp.event_score import EventScore
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 

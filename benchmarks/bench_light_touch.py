@@ -9,9 +9,9 @@ then stay for 0.6 s, at 200 Hz. *Seen*: a contact begins before the release; *wi
 which the force is reached. Sheets have a least force that they respond to: *sheet responds* is the share of
 touches under which any current flows at the end, the most that any detection can see. The paper's lightest is
 2 gf, 0.0196 N. *False contacts*: hands that nothing touches, for hours of drift of zeros, temperature and
-supply. Sampled at 25 Hz, with thresholds for that rate, 7 % lower than those for 200 Hz; *factor*: on the
-offered thresholds. *Held*: 0.1 N for an hour on five pads of the hand, at 20 Hz; *not released*: touched two
-seconds after the end.
+supply, tared at the beginning of each half hour, as it begins without a baseline. Sampled at 25 Hz, with
+thresholds for that rate, 7 % lower than those for 200 Hz; *factor*: on the offered thresholds. *Held*: 0.1 N
+for an hour on five pads of the hand, at 20 Hz; *not released*: touched two seconds after the end.
 """
 
 from __future__ import annotations
@@ -167,11 +167,15 @@ def quiet_piece(world: str, piece: int) -> list[Row]:
     pairs = offered(world, QUIET_SEEDS, QUIET_NS)
     bench = DetectionBench([factor * own for factor in FACTORS for own in pairs], QUIET_NS)
     length_s = 3600.0 / PIECES_PER_HOUR
+    from_s = START_S + MEASURED_S + piece * length_s
     began, touched_s = np.zeros(bench.model.size), np.zeros(bench.model.size)
-    for times_s in tick_times(START_S + MEASURED_S + piece * length_s, length_s, QUIET_NS):
+    for times_s in [from_s - np.arange(1.0, 0.0, -1e-9 * QUIET_NS), *tick_times(from_s, length_s, QUIET_NS)]:
         counts = np.tile(
             np.concatenate([hand.counts(times_s) for hand in hands], axis=1), (1, len(FACTORS), 1)
         )
+        if times_s[0] < from_s:
+            bench.tare(counts)
+            continue
         for t_s, row in zip(times_s.tolist(), counts, strict=True):
             began[bench.run_tick(row, round(1e9 * t_s)).began] += 1
         touched_s += bench.tick.contacts.touching * (times_s[-1] - times_s[0])

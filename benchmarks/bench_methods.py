@@ -1,28 +1,37 @@
-"""Run time against error of location: every way to locate a contact, and the compiled core among them.
+"""Run time against error: every way from four currents to position and force, and from wire to wire.
 
-A plane pad of 30 x 24 mm. *Ideal*: no gaps, no resistors; *gaps and resistors*: 1.2 mm bare at each end of an
-electrode, 120 ohm in series with each, all known; both without noise, exact currents, and so the error is the
-method's own. *World default*: the same file, pads drawn for a seed of the reporting family, 0.5 to 5 N,
-simulated by finite elements with noise and quantisation: nothing that was drawn is known. All errors are of
-contacts 5 % of a side and farther from the edges; positions off the pad are clipped to it. The paper's ways
-and the interpolator assume an ideal pad.
+A plane pad of 30 x 24 mm, contacts of 0.5 to 5 N, 5 % of a side and farther from the edges. *Ideal pad*: no
+gaps, no resistors; *gaps and resistors*: 1.2 mm bare at each end of an electrode, 120 ohm in series with
+each, all known; both exact currents without noise, and so the error is the method's own. *Solved contacts*:
+the same pads in the world `ideal`, currents of contacts solved with the sheet by finite elements, with
+noise and quantisation. *World default*: pads drawn for a seed of the reporting family, with sheets; nothing
+that was drawn is known. Estimates off the pad are clipped to it, forces to 20 N. Errors of forces are
+relative.
+
+*Paper*: its formulas, for an ideal pad; forces by eqs. 11 and 12 from the total current and the resistance
+at the pad's centre. *Common*: what one would take instead. *Labelled*: learned from presses of the same
+pad, each the mean of 12 samples with its true place and force: a polynomial whose degree is chosen by
+presses left out, a Gaussian process by marginal likelihood, a network of 16 and 16 units. *Theory*: exact,
+`handtouch.field`. *Core*: the daemon's stages as configured, and with what its calibration learned from 32
+contacts without labels; in the worlds contacts pass the daemon's pipeline, and errors are those of its
+messages. *Wire to wire*: from the last sample to encoded messages of all contacts.
 
 Microseconds are processor time per contact, medians; spread: half the distance of quartiles, the largest of
-the columns. least_squares takes one contact after the other and is timed for up to 15. Core: the daemon's
-stages, with covariance and place on the link, in calls of 60 contacts at most; *tracked*: from the last
-position, 0.1 mm away. Bulk: 20,000 contacts. *Floors*: rms of the least error by noise (Cramer-Rao, at 1 mA),
-and of an oracle that knows the distributions of all tolerances, but no values.
+the columns. least_squares takes one contact after the other. *Floors*: least rms error by noise (Cramer-
+Rao, at 1 mA), and of an oracle that knows the distributions of all tolerances, but no values.
 """
 
 from __future__ import annotations
 
 import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -30,33 +39,48 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import least_squares
 
+from benchmarks.bench_worlds import DRAWN_MORE, DRAWN_PER_LEARNT, HELD_SAMPLES, REST_SAMPLES, learn
+from benchmarks.hand_touches import REST_S, SAMPLE_S, STEP_S, TOUCH_S, TouchReadings
+from benchmarks.learned_ways import LEARNERS, Presses, learned
 from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, Rows, options, progress
 from benchmarks.scores import laplace_covariance
-from handtouch import config
+from benchmarks.touched_pads import PipelineCase, Touches, in_turns_of
+from handtouch import config, wire
+from handtouch.config.tables import SceneRequest
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
-from handtouch.core.pad_model import PadModel
+from handtouch.core.pad_model import PadModel, contact_law, law_of
 from handtouch.core.stages import solve
+from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import ElectrodeNetwork, Rectangle
 from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
 from handtouch.hand import electrode_network
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS, Family, MountSpread
-from tests.deployments import deployment_text, pad_text
+from handtouch.simulate.worlds import WORLDS, Family, MountSpread, World
+from tests.deployments import PLAIN_SHEET, deployment_text, pad_text
 from tests.exact_pads import ExactPads
 
 FloatArray = NDArray[np.float64]
+Estimator = Callable[[FloatArray], FloatArray]
+"""Places x, y [m] and forces [N] (3, n) from currents (4, n) [A] of x0, xa, y0, yb."""
 Position = tuple[FloatArray, FloatArray]
-Locator = Callable[[FloatArray], Position]
-"""Positions x, y (n,) [m] from currents (4, n) [A] of x0, xa, y0, yb."""
+Kind = Literal["core", "theory", "paper", "common", "labelled"]
 
-LENGTH_MM, WIDTH_MM = 30.0, 24.0
+LENGTH_MM, WIDTH_MM, DRIVE_V = 30.0, 24.0, 5.0
 CORE_PADS = 60
 """Pads of the core's model; more contacts are solved in several calls."""
-CELLS, TRAINED, DEGREE = 64, 20_000, 11
-MARGIN = 0.02
+CELLS, MARGIN, MAX_FORCE_N = 64, 0.05, 20.0
+FORCES_N = (0.5, 5.0)
+CALLS = (1, 15, 60)
+SLIDE_M = 1e-4
+"""Between two samples: 20 mm/s at 200 Hz."""
+BATCH_S, BATCHES, FEW_BATCHES = 0.02, 15, 3
+LABELLED, UNLABELLED, WARM_UP = (16, 64, 256, 512), 32, 12
+FEW, MANY = 100, 2000
+"""Contacts of which errors are measured, of slow ways and of others, of exact currents"""
+AS_CONFIGURED, AFTER = "core, as configured", f"core, after {UNLABELLED} unlabelled contacts"
 
 
 @dataclass(frozen=True)
@@ -71,21 +95,20 @@ class Setup:
         surface = f'{{ kind = "plane", length_mm = {LENGTH_MM}, width_mm = {WIDTH_MM} }}'
         extra = f"series_ohm = {[self.series_ohm] * 4}"
         texts = [pad_text(f"p{k}", k + 1, surface, extra, gap_mm=self.gap_mm) for k in range(pads)]
-        return config.parse(deployment_text(*texts, daemon=""))
+        return config.parse(deployment_text(*texts, daemon="").replace(PLAIN_SHEET, ""))
 
     @cached_property
     def model(self) -> PadModel:
         """`CORE_PADS` such pads as the daemon has them."""
-        return PadModel(self.deployment(CORE_PADS))
+        return build_pad_model(self.deployment(CORE_PADS))
 
     @cached_property
     def pad(self) -> Rectangle | ElectrodeNetwork:
         """The exact forward model."""
         if not self.gap_mm:
             return self.rectangle
-        deployment = self.deployment(1)
-        pad = deployment.pads[0].pad
-        return electrode_network(pad, deployment.sheets[pad.sheet])
+        pad = self.deployment(1).pads[0].pad
+        return electrode_network(pad, self.deployment(1).sheets[pad.sheet])
 
     @property
     def rectangle(self) -> Rectangle:
@@ -97,23 +120,94 @@ class Setup:
         """Standard deviations (4, 1) of the channels."""
         return np.asarray(self.model.noise_a[0][:, None])
 
+    @cached_property
+    def law(self) -> tuple[Any, float]:
+        """The contact law and the sheet resistance of the file."""
+        sheet = self.deployment(1).sheets["s"]
+        return contact_law(sheet, law_of(sheet)), sheet.ohm_per_square
+
+    def spreading(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the spreading radius [m] and the resistance of the resistors [ohm] (n,) there."""
+        pad = self.pad
+        if isinstance(pad, Rectangle):
+            return np.asarray(pad.conformal_radius(x, y)), np.zeros_like(x)
+        fractions, form = pad.fractions(x, y), pad.series_quadratic_form
+        series = np.einsum("in,ij,jn->n", fractions, form, fractions)
+        return np.asarray(pad.spreading_radius(x, y)), series
+
+    def currents(self, truth: FloatArray) -> FloatArray:
+        """Return the exact currents (4, n) of contacts (3, n)."""
+        law, sheet_ohm = self.law
+        x, y, force = truth
+        return np.asarray(
+            law.current(force, DRIVE_V, sheet_ohm, *self.spreading(x, y)) * self.pad.fractions(x, y)
+        )
+
+    def force(self, total_a: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the force (n,) of currents at these places, by the law of the file."""
+        law, sheet_ohm = self.law
+        sides = self.pad.a, self.pad.b
+        inside = [np.clip(at, 1e-3 * side, 0.999 * side) for at, side in zip((x, y), sides, strict=True)]
+        found = law.force(np.maximum(total_a, 1e-12), DRIVE_V, sheet_ohm, *self.spreading(*inside))
+        return np.asarray(found.force_n)
+
+    def draw(self, count: int, seed: int) -> FloatArray:
+        """Return random contacts (3, count)."""
+        rng, sides = np.random.default_rng(seed), np.array([[self.pad.a], [self.pad.b]])
+        places = sides * rng.uniform(MARGIN, 1 - MARGIN, (2, count))
+        low, high = np.log(FORCES_N)
+        return np.concatenate([places, np.exp(rng.uniform(low, high, (1, count)))])
+
 
 @dataclass(frozen=True)
 class Way:
-    """One way to locate; `make` builds its tables."""
+    """One way; `make` builds its tables, of a setup and of labelled presses of a pad."""
 
-    make: Callable[[Setup], Locator]
-    kind: Literal["core", "handtouch", "paper", "instead"]
-    ideal_only: bool = False
-    """For pads without gaps and resistors alone."""
-    samples: int = 20_000
-    """Contacts of which errors are measured; few for slow ones, which take one contact after the other."""
+    kind: Kind
+    make: Callable[[Setup, Presses], Estimator]
+    labels: int | None = None
+    """Presses that it learns from."""
+    is_slow: bool = False
+    """It takes one contact after the other."""
 
 
 # Of the paper and of handtouch
 
 
-def exact(setup: Setup) -> Locator:
+def at_centre(locate: Callable[[Setup], Callable[[FloatArray], Position]]) -> Callable[..., Estimator]:
+    """Return the maker of a way whose force is that of a contact at the pad's centre."""
+
+    def make(setup: Setup, _: Presses) -> Estimator:
+        located = locate(setup)
+        middle = np.array([setup.rectangle.a / 2]), np.array([setup.rectangle.b / 2])
+        law, sheet_ohm = setup.law
+        radius = setup.rectangle.conformal_radius(*middle)
+
+        def estimate(currents: FloatArray) -> FloatArray:
+            force = law.force(np.maximum(currents.sum(axis=0), 1e-12), DRIVE_V, sheet_ohm, radius).force_n
+            return np.stack([*located(currents), np.asarray(force)])
+
+        return estimate
+
+    return make
+
+
+def at_place(locate: Callable[[Setup], Callable[[FloatArray], Position]]) -> Callable[..., Estimator]:
+    """Return the maker of a way whose force is that of a contact at the place found."""
+
+    def make(setup: Setup, _: Presses) -> Estimator:
+        located = locate(setup)
+
+        def estimate(currents: FloatArray) -> FloatArray:
+            x, y = located(currents)
+            return np.stack([x, y, setup.force(currents.sum(axis=0), x, y)])
+
+        return estimate
+
+    return make
+
+
+def exact(setup: Setup) -> Callable[[FloatArray], Position]:
     def locate(currents: FloatArray) -> Position:
         found = setup.pad.locate(currents)
         return found.x, found.y
@@ -121,7 +215,7 @@ def exact(setup: Setup) -> Locator:
     return locate
 
 
-def likelihood(setup: Setup) -> Locator:
+def likelihood(setup: Setup) -> Callable[[FloatArray], Position]:
     def locate(currents: FloatArray) -> Position:
         found = setup.pad.estimate(currents, setup.noise_a)
         return found.x, found.y
@@ -129,24 +223,24 @@ def likelihood(setup: Setup) -> Locator:
     return locate
 
 
-def core(setup: Setup, *, tracked: bool) -> Locator:
-    """Return the daemon's stages, compiled where they are: position, covariance and place on the link.
+def core(setup: Setup, *, tracked: bool) -> Estimator:
+    """Return the daemon's stages, compiled where they are: position, force, covariance and place on the link.
 
     If tracked, the contact in a column is located from its last position.
     """
     size = setup.model.size
-    rows, columns = np.arange(size), VALUE_SLICES["xy"]
+    rows, xy, force = np.arange(size), VALUE_SLICES["xy"], VALUE_SLICES["force_n"].start
     parts: list[tuple[ContactSolver, FloatArray, FloatArray]] = []
 
     def part(number: int) -> tuple[ContactSolver, FloatArray, FloatArray]:
         while len(parts) <= number:
             given, values = np.zeros((size, 4)), np.full((size, VALUE_COUNT), np.nan)
-            force = np.zeros(size, np.bool_)
-            parts.append((make_solver(setup.model, given, np.zeros(size), force, values), given, values))
+            wanted = np.ones(size, np.bool_)
+            parts.append((make_solver(setup.model, given, np.zeros(size), wanted, values), given, values))
         return parts[number]
 
-    def locate(currents: FloatArray) -> Position:
-        found = np.empty((currents.shape[1], 2))
+    def estimate(currents: FloatArray) -> FloatArray:
+        found = np.empty((currents.shape[1], 3))
         for number, first in enumerate(range(0, len(found), size)):
             solver, given, values = part(number if tracked else 0)
             columns_now = currents[:, first : first + size].T
@@ -155,43 +249,16 @@ def core(setup: Setup, *, tracked: bool) -> Locator:
             if not tracked:
                 values[:n] = np.nan
             solver.solve_contacts(rows[:n].data)
-            found[first : first + n] = values[:n, columns]
-        return found[:, 0], found[:, 1]
+            found[first : first + n, :2], found[first : first + n, 2] = values[:n, xy], values[:n, force]
+        return np.asarray(found.T)
 
-    return locate
+    return estimate
 
 
 # What a user would take instead
 
 
-def nominal_contacts(setup: Setup, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return positions (2, count) [m] and fractions (4, count) of contacts by the forward model."""
-    sides = np.array([[setup.pad.a], [setup.pad.b]])
-    at = sides * np.random.default_rng(11).uniform(MARGIN, 1 - MARGIN, (2, count))
-    return at, setup.pad.fractions(*at)
-
-
-def polynomial(setup: Setup) -> Locator:
-    """Return a regression on the two ratios of opposite sides, of degree 11, trained on 20 000 contacts."""
-    powers = np.array([p for p in product(range(DEGREE + 1), repeat=2) if sum(p) <= DEGREE])
-
-    def features(currents: FloatArray) -> FloatArray:
-        low, high = currents[::2], currents[1::2]
-        ratios = (high - low) / (high + low)
-        x, y = ratios[:, None] ** np.arange(DEGREE + 1)[:, None]  # (powers, n) each
-        return np.asarray((x[powers[:, 0]] * y[powers[:, 1]]).T)
-
-    at, fractions = nominal_contacts(setup, TRAINED)
-    weights, *_ = np.linalg.lstsq(features(fractions), at.T, rcond=None)
-
-    def locate(currents: FloatArray) -> Position:
-        x, y = (features(currents) @ weights).T
-        return x, y
-
-    return locate
-
-
-def grid_interpolator(setup: Setup) -> Locator:
+def grid_interpolator(setup: Setup) -> Callable[[FloatArray], Position]:
     """Return eq. 8 corrected by scipy's cubic RegularGridInterpolator, as in a look-up table of one's own."""
     adjusted, table = LogRatioTable(setup.rectangle, cells=0), LogRatioTable(setup.rectangle, CELLS)
     places, origin, steps = table.correction_table
@@ -205,17 +272,10 @@ def grid_interpolator(setup: Setup) -> Locator:
     return locate
 
 
-def fit_of_sums(setup: Setup) -> Locator:
-    """Return scipy's least_squares on the paper's eqs. 4-5, ten terms."""
-    return _one_by_one(setup, lambda x, y: single_sum_fractions(setup.rectangle, x, y))
-
-
-def fit_of_field(setup: Setup) -> Locator:
-    """Return scipy's least_squares on the exact forward model."""
-    return _one_by_one(setup, lambda x, y: setup.pad.fractions(x, y))
-
-
-def _one_by_one(setup: Setup, forward: Callable[[float, float], FloatArray]) -> Locator:
+def one_by_one(
+    setup: Setup, forward: Callable[[float, float], FloatArray]
+) -> Callable[[FloatArray], Position]:
+    """Return scipy's least_squares on a forward model."""
     a, b = setup.rectangle.a, setup.rectangle.b
     bounds = (1e-3 * a, 1e-3 * b), (0.999 * a, 0.999 * b)
 
@@ -236,124 +296,166 @@ def _one_by_one(setup: Setup, forward: Callable[[float, float], FloatArray]) -> 
     return locate
 
 
+def fit_of_sums(setup: Setup) -> Callable[[FloatArray], Position]:
+    return one_by_one(setup, lambda x, y: single_sum_fractions(setup.rectangle, x, y))
+
+
+def fit_of_field(setup: Setup) -> Callable[[FloatArray], Position]:
+    return one_by_one(setup, lambda x, y: setup.pad.fractions(x, y))
+
+
+def _learned(fit: Callable[..., Any], _: Setup, presses: Presses) -> Any:
+    return learned(fit, presses)
+
+
 WAYS: dict[str, Way] = {
-    "log-ratio (eq. 8)": Way(lambda setup: lambda currents: log_ratio(setup.rectangle, currents), "paper"),
+    "log-ratio (eq. 8)": Way("paper", at_centre(lambda setup: partial(log_ratio, setup.rectangle))),
     "log-ratio, adjusted (fig. 3)": Way(
-        lambda setup: LogRatioTable(setup.rectangle, cells=0).locate, "paper"
+        "paper", at_centre(lambda setup: LogRatioTable(setup.rectangle, cells=0).locate)
     ),
-    "exact inverse": Way(exact, "handtouch"),
-    "likelihood, exact field": Way(likelihood, "handtouch"),
-    "core, new contacts": Way(lambda setup: core(setup, tracked=False), "core"),
-    "core, tracked contacts": Way(lambda setup: core(setup, tracked=True), "core"),
-    "polynomial regression": Way(polynomial, "instead"),
-    "RegularGridInterpolator": Way(grid_interpolator, "instead"),
-    "least_squares, eqs. 4-5": Way(fit_of_sums, "instead", samples=200),
-    "least_squares, exact field": Way(fit_of_field, "instead", samples=100),
+    "log-ratio, table of 32 cells": Way(
+        "paper", at_centre(lambda setup: LogRatioTable(setup.rectangle).locate)
+    ),
+    "RegularGridInterpolator": Way("common", at_centre(grid_interpolator)),
+    "least_squares, eqs. 4-5": Way("common", at_centre(fit_of_sums), is_slow=True),
+    "least_squares, exact field": Way("common", at_place(fit_of_field), is_slow=True),
+    **{
+        f"{name}, {count} presses": Way("labelled", partial(_learned, fit), count)
+        for name, fit in LEARNERS.items()
+        for count in LABELLED
+    },
+    "exact inverse": Way("theory", at_place(exact)),
+    "likelihood, exact field": Way("theory", at_place(likelihood)),
+    "core, new contacts": Way("core", lambda setup, _: core(setup, tracked=False)),
+    AS_CONFIGURED: Way("core", lambda setup, _: core(setup, tracked=True)),
 }
 """By name."""
-
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
-CALLS = (1, 15, 60, 960)
-BULK = 20_000
-MARGIN = 0.05
-TOTAL_A = 1e-3
-"""Current of a contact: about that of a touch of 1 N on this pad."""
-SLIDE_M = 1e-4
-"""Between two samples: 20 mm/s at 200 Hz."""
-BATCH_S, BATCHES, FEW_BATCHES = 0.02, 15, 3
 IDEAL, BUILT = Setup(0.0, 0.0), Setup(1.2, 120.0)
-WORLD_PADS, WORLD_TOUCHES, STEP_S = 30, 40, 0.5
-FORCES_N = (0.5, 5.0)
+
+
+# Cases
+
+
+@dataclass(frozen=True)
+class PadCase:
+    """Contacts of one pad, presses that ways may learn from, and what the daemon's messages say, by state."""
+
+    contacts: Presses
+    labelled: Presses
+    served: Mapping[str, FloatArray]
 
 
 @dataclass(frozen=True)
 class Case:
-    """Contacts on pads of one setup: currents (4, n) [A]; `error_m` returns the errors (n,) of positions."""
+    """Contacts on pads of one setup, and the least errors by cause: of positions [mm] and of forces."""
 
     name: str
     setup: Setup
-    currents: FloatArray
-    error_m: Callable[[FloatArray, FloatArray], FloatArray]
-    floors_mm: dict[str, float]
-    """Rms errors that no way can beat, by cause."""
-
-
-def position_bound_mm(setup: Setup, x: FloatArray, y: FloatArray, total_a: float) -> float:
-    """Return the rms Cramer-Rao bound of positions from the noise of the channels."""
-    fractions, jacobian = setup.pad.fractions_with_jacobian(x, y)
-    design = np.moveaxis(np.concatenate([total_a * jacobian, fractions[:, None]], axis=1), 2, 0)
-    covariance = laplace_covariance(design, setup.noise_a[:, 0], np.full(3, np.inf))[:, :2, :2]
-    return 1e3 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean()))
-
-
-def positions(setup: Setup, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Return random positions x, y (count,) [m], 5 % of a side and farther from the edges."""
-    rng, sides = np.random.default_rng(seed), np.array([[setup.pad.a], [setup.pad.b]])
-    x, y = sides * rng.uniform(MARGIN, 1 - MARGIN, (2, count))
-    return x, y
+    pads: Sequence[PadCase]
+    floors: dict[str, tuple[float, float | None]]
 
 
 def exact_case(name: str, setup: Setup, count: int) -> Case:
     """Return contacts whose currents are those of the exact field."""
-    x, y = positions(setup, count, 0)
+    truth, labels = setup.draw(count, 0), setup.draw(max(LABELLED), 11)
+    pad = PadCase(Presses(setup.currents(truth), truth), Presses(setup.currents(labels), labels), {})
+    fractions, jacobian = setup.pad.fractions_with_jacobian(*truth[:2])
+    design = np.moveaxis(np.concatenate([1e-3 * jacobian, fractions[:, None]], axis=1), 2, 0)
+    covariance = laplace_covariance(design, setup.noise_a[:, 0], np.full(3, np.inf))[:, :2, :2]
+    floor = 1e3 * float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean()))
+    return Case(name, setup, [pad], {"noise of the channels": (floor, None)})
 
-    def error_m(found_x: FloatArray, found_y: FloatArray) -> FloatArray:
-        return np.hypot(found_x - x[: len(found_x)], found_y - y[: len(found_y)])
 
-    floor = {"noise of the channels": position_bound_mm(setup, x, y, TOTAL_A)}
-    return Case(name, setup, TOTAL_A * setup.pad.fractions(x, y), error_m, floor)
-
-
-def world_case(setup: Setup, pads: int, touches: int) -> Case:
-    """Return touches in the world `default`, simulated by finite elements: one sample of each."""
-    deployment, world = setup.deployment(pads), replace(WORLDS["default"], mounts=MountSpread())
-    drawn = world.with_sheets().draw(Family.REPORTING.seed(0))  # sheets change the force, no position
-    hand_name, entries = deployment.hands[0].name, deployment.hands[0].pads
-    rng, (low, high) = np.random.default_rng((drawn.seed, 6)), np.log(FORCES_N)
-    scenario = Scenario(
-        touch=tuple(
-            ScenarioTouch(
-                link=pad.link,
-                from_s=1.0 + k * STEP_S,
-                duration_s=0.4,
-                path=((float(x), float(y)),),
-                force_n=(float(np.exp(force)),),
-            )
-            for k in range(touches)
-            for pad in entries
-            for x, y, force in [(*rng.uniform(MARGIN, 1 - MARGIN, 2), rng.uniform(low, high))]
+def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioTouch, ...]:
+    """Return `count` touches of each pad, one after the other."""
+    rng, low_high = np.random.default_rng((seed, 6)), np.log(FORCES_N)
+    return tuple(
+        ScenarioTouch(
+            link=link,
+            from_s=REST_S + number * STEP_S,
+            duration_s=TOUCH_S,
+            path=(tuple(rng.uniform(MARGIN, 1 - MARGIN, 2)),),
+            force_n=(float(np.exp(rng.uniform(*low_high))),),
         )
+        for number in range(count)
+        for link in links
     )
-    hand = VirtualHand(deployment, scenario, drawn)
-    times_s = 1.2 + STEP_S * np.arange(touches)
-    counts = np.stack([hand.counts(row, times_s) for row in range(pads)], axis=1)  # (touches, pads, 4)
-    truth = [{record.link: record for record in hand.truth(t_s)} for t_s in times_s.tolist()]
-    points = np.array([[by_link[pad.link].position_m for pad in entries] for by_link in truth])
-    model, flat = setup.model, points.reshape(-1, 3)
-    exact = ExactPads(setup.deployment(CORE_PADS), model)
-    currents = np.ascontiguousarray((counts * model.ampere_per_count[0]).reshape(-1, 4).T)
 
-    def error_m(x: FloatArray, y: FloatArray) -> FloatArray:
-        n = len(x)
-        position_m = exact.position_m(np.zeros(n, np.intp), x, y)
-        return np.asarray(np.linalg.norm(position_m - flat[:n], axis=1))
 
-    variance, noise = [], []
-    for row, pad in enumerate(entries):
-        oracle = PadOracle.build(drawn, deployment, hand_name, pad, model.noise_a[0])
-        own = [by_link[pad.link] for by_link in truth]
-        u, v, force = np.array([(record.u_m, record.v_m, record.force_n) for record in own]).T
-        variance.append(np.trace(oracle.covariances(u, v, force).position_m2, axis1=1, axis2=2))
-        noise += [record.bound_m for record in own]
-        print(f"world default: oracle of pad {row + 1} of {pads}", flush=True)
-    floors = {
-        "tolerances and noise": 1e3 * float(np.sqrt(np.mean(variance))),
-        "noise of the channels": 1e3 * float(np.sqrt(np.mean(np.square(noise)))),
+def world_case(name: str, world: World, setup: Setup, pads: int, touches: int) -> Case:
+    """Return touches of so many pads in a world, through the daemon's pipeline: one sample of each."""
+    drawn = replace(world, mounts=MountSpread()).draw(Family.REPORTING.seed(0))
+    deployment = drawn.describe(setup.deployment(pads))
+    model = build_pad_model(deployment)
+    tests = range(WARM_UP, WARM_UP + touches)
+    others = range(tests.stop, tests.stop + round(DRAWN_PER_LEARNT * UNLABELLED) + DRAWN_MORE)
+    labels = range(others.stop, others.stop + max(LABELLED))
+    hand = VirtualHand(deployment, Scenario(touch=draw_touches(model.links, labels.stop, drawn.seed)), drawn)
+    readings = TouchReadings.of_hand(hand, deployment, tests)
+    truths = readings.truths | {
+        (k, truth.link): truth for k in labels for truth in hand.truth(REST_S + k * STEP_S + SAMPLE_S)
     }
-    return Case("world default", setup, currents, error_m, floors)
+    served = {AS_CONFIGURED: readings.contacts(model, deployment)}
+    for row in range(pads):
+        calibration = learn(hand, deployment, model, row, others, (UNLABELLED,))[0].calibration
+        if calibration:
+            model.set_calibration(row, calibration)
+    served[AFTER] = readings.contacts(model, deployment)
+    plane = ExactPads(deployment, model)
+    corner, along, across = plane.position_m([0] * 3, [0.0, setup.pad.a, 0.0], [0.0, 0.0, setup.pad.b])
+    axes = np.stack([(along - corner) / setup.pad.a, (across - corner) / setup.pad.b])
+
+    def truth_of(numbers: range, link: str) -> FloatArray:
+        own = [truths[k, link] for k in numbers]
+        return np.array([[*(axes @ (np.array(one.position_m) - corner)), one.force_n] for one in own]).T
+
+    def answer(contact: wire.Contact | None) -> list[float]:
+        if contact is None or contact.position_m is None:
+            return [np.nan] * 3
+        force = np.nan if contact.force_n is None else contact.force_n
+        return [*(axes @ (np.array(contact.position_m) - corner)), force]
+
+    found, variance = [], []
+    for row, (hand_name, pad) in enumerate(deployment.pads):
+        amperes = setup.model.ampere_per_count[0][:, None]
+        presses = [
+            Presses(amperes * counts_of(hand, row, numbers, samples), truth_of(numbers, pad.link))
+            for numbers, samples in ((tests, 1), (labels, HELD_SAMPLES))
+        ]
+        answers = {
+            state: np.array([answer(contacts.get((k, pad.link))) for k in tests]).T
+            for state, contacts in served.items()
+        }
+        found.append(PadCase(presses[0], presses[1], answers))
+        oracle = PadOracle.build(drawn, deployment, hand_name, pad, model.noise_a[row])
+        own = [truths[k, pad.link] for k in tests]
+        u, v, force = np.array([(one.u_m, one.v_m, one.force_n) for one in own]).T
+        least = oracle.covariances(u, v, force)
+        position2 = np.trace(least.position_m2, axis1=1, axis2=2)
+        variance.append(
+            (position2, least.force_n2[:, 0, 0] / force**2, np.square([one.bound_m for one in own]))
+        )
+        progress(f"{name}: pad {row + 1} of {pads}")
+    position, relative, noise = (float(np.sqrt(np.mean(part))) for part in zip(*variance, strict=True))
+    floors = {
+        "tolerances and noise": (1e3 * position, relative),
+        "noise of the channels": (1e3 * noise, None),
+    }
+    return Case(name, setup, found, floors)
+
+
+def counts_of(hand: VirtualHand, row: int, numbers: range, samples: int) -> FloatArray:
+    """Return the means (4, n) of the last samples of touches, less their zeros before."""
+    begin_s = REST_S + np.array(numbers)[:, None] * STEP_S
+    held_s = begin_s + SAMPLE_S - 0.005 * np.arange(samples)
+    rest_s = begin_s - 0.005 * np.arange(1, REST_SAMPLES + 1)
+    held, rest = (
+        hand.counts(row, times.ravel()).reshape(*times.shape, -1).mean(axis=1) for times in (held_s, rest_s)
+    )
+    return np.asarray((held - rest).T)
+
+
+# Measuring
 
 
 def microseconds(call: Callable[[], Any], most: int) -> tuple[float, float]:
@@ -372,84 +474,128 @@ def microseconds(call: Callable[[], Any], most: int) -> tuple[float, float]:
     return middle, 100 * float(high - low) / 2 / middle
 
 
-def times(setup: Setup, name: str, locate: Locator, quick: bool) -> tuple[dict[str, float], float]:
+def times(setup: Setup, way: Way, estimate: Estimator, quick: bool) -> dict[str, Any]:
     """Return microseconds a contact by number of contacts, and the largest spread in %.
 
     Two samples take turns between which contacts slide by 0.1 mm.
     """
-    way, found, spreads = WAYS[name], dict[str, float](), []
-    slow = way.samples < max(CALLS)
-    for count in CALLS[: 2 if slow or quick else None]:
-        x, y = positions(setup, count, 2)
-        pair = [np.ascontiguousarray(TOTAL_A * setup.pad.fractions(x + shift, y)) for shift in (0.0, SLIDE_M)]
+    found, spreads = dict[str, Any](), []
+    for count in CALLS[: 2 if way.is_slow or quick else None]:
+        truth = setup.draw(count, 2)
+        slid = truth + np.array([[SLIDE_M], [0.0], [0.0]])
+        pair = [np.ascontiguousarray(setup.currents(contacts)) for contacts in (truth, slid)]
 
         def both(pair: Sequence[FloatArray] = pair) -> None:
-            locate(pair[0])
-            locate(pair[1])
+            estimate(pair[0])
+            estimate(pair[1])
 
         us, spread = microseconds(both, 1 if quick else BATCHES)
-        found[str(count)] = us / 2 / count
+        found[f"us each, {count} in a call"] = us / 2 / count
         spreads.append(spread)
-    if not slow and not quick and "tracked" not in name:
-        bulk = TOTAL_A * setup.pad.fractions(*positions(setup, BULK, 3))
-        us, spread = microseconds(partial(locate, bulk), FEW_BATCHES)
-        found["bulk"] = us / BULK
-        spreads.append(spread)
-    return found, max(spreads)
+    return found | {"spread, %": max(spreads)}
 
 
-def errors_mm(case: Case, name: str, locate: Locator) -> FloatArray:
-    """Return the errors (n,) of a way in a case, NaN without a position; positions are clipped to the pad."""
-    currents = case.currents[:, : WAYS[name].samples]
-    with np.errstate(all="ignore"):
-        x, y = locate(currents)
-    clipped = np.clip(x, 0, case.setup.pad.a), np.clip(y, 0, case.setup.pad.b)
-    return 1e3 * case.error_m(*clipped)
+def wire_times(setup: Setup, quick: bool) -> dict[str, Any]:
+    """Return the microseconds a contact from the last sample to encoded messages."""
+    found, spreads = dict[str, Any](), []
+    for count in CALLS:
+        case = PipelineCase(setup.model, ("contact/",), SceneRequest())
+        (row,) = in_turns_of({"": case}, Touches(setup.model, count), 20 if quick else 1000)
+        found[f"us each, {count} in a call"] = row["us a tick"] / count
+        low, high = np.percentile(case.spent_ns, [25, 75])
+        spreads.append(50 * float(high - low) / float(np.median(case.spent_ns)))
+    return found | {"spread, %": max(spreads)}
 
 
-def measure(cases: Sequence[Case], quick: bool) -> dict[str, Rows]:
-    """Return the rows of all ways; cases of one setup share its tables and run times."""
-    rows: dict[str, Rows] = {case.name: [] for case in cases}
-    for setup in dict.fromkeys(case.setup for case in cases):
-        for name, way in WAYS.items():
-            if way.ideal_only and setup != IDEAL:
-                continue
-            locate = way.make(setup)
-            us, spread = times(setup, name, locate, quick)
-            for case in (case for case in cases if case.setup == setup):
-                error = errors_mm(case, name, locate)
-                known = error[np.isfinite(error)]
-                rows[case.name].append(
-                    {
-                        "kind": way.kind,
-                        "way": name,
-                        "rms, mm": f"{np.sqrt(np.mean(known**2)):.1e}",
-                        "median": f"{np.median(known):.1e}",
-                        "worst": f"{known.max():.1e}",
-                        "no answer, %": 100 * (1 - len(known) / len(error)),
-                        **{f"us each, {n} in a call": us.get(str(n)) for n in CALLS},
-                        "us each, bulk": us.get("bulk"),
-                        "spread, %": spread,
-                    }
-                )
-                progress(rows[case.name][-1])
+def errors(setup: Setup, found: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return errors of positions [mm] and of forces, relative (n,) each; NaN without an answer."""
+    truth = truth[:, : found.shape[1]]
+    x, y = np.clip(found[0], 0, setup.pad.a), np.clip(found[1], 0, setup.pad.b)
+    force = np.clip(found[2], 0.0, MAX_FORCE_N)
+    return 1e3 * np.hypot(x - truth[0], y - truth[1]), force / truth[2] - 1
+
+
+def scored(parts: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, Any]:
+    """Return the cells of the errors of all pads."""
+    position, force = (np.concatenate(column) for column in zip(*parts, strict=True))
+    some, relative = position[np.isfinite(position)], np.abs(force[np.isfinite(force)])
+    return {
+        "position rms, mm": f"{np.sqrt(np.mean(some**2)):.1e}",
+        "median, mm": f"{np.median(some):.1e}",
+        "force rms, %": f"{100 * np.sqrt(np.mean(relative**2)):.1e}",
+        "median, %": f"{100 * np.median(relative):.1e}",
+        "no answer, %": 100 * (1 - len(some) / len(position)),
+    }
+
+
+def measure_setup(cases: Sequence[Case], quick: bool) -> dict[str, Rows]:
+    """Return the rows of the cases of one setup, which share run times."""
+    setup, rows = cases[0].setup, {case.name: Rows() for case in cases}
+    spent = {}
+    for name, way in WAYS.items():
+        if quick and way.labels not in (None, LABELLED[0]):
+            continue
+        presses = cases[0].pads[0].labelled
+        spent[name] = times(setup, way, way.make(setup, presses.first(way.labels or 1)), quick)
+        for case in cases:
+            parts = []
+            for pad in case.pads:
+                found = pad.served.get(name)
+                if found is None:
+                    estimate = way.make(setup, pad.labelled.first(way.labels or 1))
+                    with np.errstate(all="ignore"):
+                        found = estimate(pad.contacts.currents[:, : FEW if way.is_slow else None])
+                parts.append(errors(setup, found, pad.contacts.truth))
+            rows[case.name].append({"kind": way.kind, "way": name, **scored(parts), **spent[name]})
+            progress(rows[case.name][-1])
+    wired = wire_times(setup, quick)
+    for case in cases:
+        own = rows[case.name]
+        for state, name in (
+            (AS_CONFIGURED, "wire to wire, as configured"),
+            (AFTER, f"wire to wire, {AFTER[6:]}"),
+        ):
+            if state in case.pads[0].served:
+                if state == AFTER:
+                    parts = [errors(setup, pad.served[state], pad.contacts.truth) for pad in case.pads]
+                    own.append({"kind": "core", "way": AFTER, **scored(parts), **spent[AS_CONFIGURED]})
+                same = next(row for row in own if row["way"] == state)
+                own.append(same | {"way": name} | wired)
     return rows
 
 
 def main() -> None:
     quick = options(__doc__).parse_args().quick
-    count = 300 if quick else 20_000
+    count, pads, touches = (200, 1, 6) if quick else (MANY, 12, 40)
     cases = [
         exact_case("ideal pad", IDEAL, count),
         exact_case("gaps and resistors", BUILT, count),
-        world_case(BUILT, 2 if quick else WORLD_PADS, 5 if quick else WORLD_TOUCHES),
+        world_case("solved contacts", WORLDS["ideal"], BUILT, max(1, pads // 3), touches),
+        world_case("world default", WORLDS["default"], BUILT, pads, touches),
     ]
     report = Report(
-        quick, contacts=[case.currents.shape[1] for case in cases], compiled=solve.__file__.endswith(".so")
+        quick,
+        contacts=[sum(pad.contacts.truth.shape[1] for pad in case.pads) for case in cases],
+        compiled=solve.__file__.endswith(".so"),
     )
-    for name, rows in measure(cases, quick).items():
-        report.table(name.capitalize(), rows)
-    report.table("Floors, mm", [{"case": case.name, **case.floors_mm} for case in cases])
+    rows: dict[str, Rows] = {}
+    for setup in (IDEAL, BUILT):
+        rows |= measure_setup([case for case in cases if case.setup == setup], quick)
+    for name, of_case in rows.items():
+        report.table(name.capitalize(), of_case)
+    report.table(
+        "Floors",
+        [
+            {
+                "case": case.name,
+                "cause": cause,
+                "position rms, mm": at[0],
+                "force rms, %": at[1] and 100 * at[1],
+            }
+            for case in cases
+            for cause, at in case.floors.items()
+        ],
+    )
     report.keep()
 
 

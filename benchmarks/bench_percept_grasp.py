@@ -39,7 +39,7 @@ from benchmarks.grasp_run import Served, drawn_world, served
 from benchmarks.scores import Rate, Share
 from handtouch import wire
 from handtouch.config import Deployment, load, shipped
-from handtouch.core.slip import GripModel
+from handtouch.core.stages.slip import GripModel
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad
 from handtouch.simulate.grasp.simulation import GraspRecord

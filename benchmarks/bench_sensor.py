@@ -1,4 +1,4 @@
-"""Processor time of a hand's reading by `TactileSensor`, 64 environments at once, beside MuJoCo's own steps.
+"""Processor time of a hand's reading by `TactileSensor`, 256 environments at once, beside MuJoCo's own steps.
 
 The links of the shipped hand in a scene of their own, each with a plate beneath its pad; in each environment
 a ball is pressed onto one pad, or onto none. *Reading*: of a hand of 15 pads, 200 a second, in processor
@@ -25,7 +25,7 @@ from handtouch.hand.pads import mount_transform
 from handtouch.simulate import TactileSensor
 from handtouch.simulate.worlds import Family
 
-ENVIRONMENTS, READINGS, PROCESSES = 64, 300, 2
+ENVIRONMENTS, READINGS, PROCESSES = 256, 100, 2
 SETTLING_READINGS = 40
 APART_M, BALL_M, FORCE_N = 0.3, 0.006, 1.0
 GOALS = {"untouched": 100_000, "one pad touched": 35_000}

@@ -42,20 +42,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.daemon_settings import InlineProcess, pipeline_of
+from benchmarks.daemon_settings import InlineProcess, pipeline_of, request_percepts
+from benchmarks.grip_touch import GripTouch
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import EventScore, Rate, Share, score_events
 from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel
-from handtouch.core.scene import RequestedOutputs
+from handtouch.core.stages.slip import INFORMATION
 from handtouch.daemon.noise_report import NoiseReport
 from handtouch.daemon.percepts import PerceptPublisher
-from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, Fixed
-from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = npt.NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
@@ -147,13 +146,7 @@ def run(
     collector, model = PerceptCollector(), PadModel(deployment)
     pipeline = pipeline_of(deployment, collector, model=model, period_ns=period_ns)
     perceiving = PerceptPublisher(deployment, pipeline, collector, process=InlineProcess(deployment))
-    all_pads = np.ones(model.size, dtype=np.bool_)
-    percepts = np.zeros((len(PERCEPT_KINDS), model.size), dtype=np.bool_)
-    percepts[PERCEPT_KINDS.index("motion")] = True
-    requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), ~all_pads, ~all_pads)
-    requested = requested._replace(percepts=percepts)
-    pipeline.apply_demand(requested)
-    perceiving.set_requested(requested, 0)
+    request_percepts(pipeline, perceiving, ["motion"])
     slip, queued_s = pipeline.tick.slip, [0.0]
     pipeline.on_messages_queued = lambda: queued_s.append(time.thread_time())
     shape = len(times), model.size
@@ -174,10 +167,10 @@ def run(
         perceived_s = time.thread_time()
         pipeline.prepare_next_tick()
         durations_s[:, k] = queued_s[-1] - began_s, ticked_s - queued_s[-1], perceived_s - ticked_s
-        log_odds[k], running[k] = slip.column("log_ratio"), slip.column("slipping") != 0
+        contacts = slip.contacts()
+        log_odds[k], running[k] = contacts.log_ratio, contacts.slipping != 0
         if k == round(information_s * hz):
-            per_axis = [slip.column(f"information_{axis}") for axis in "xy"]
-            information = slip.column("onset_ages_s").copy(), np.mean(per_axis, axis=0)
+            information = contacts.onset_ages_s.copy(), contacts.ramps[:, :, INFORMATION].mean(axis=1)
         if k == round(named_s * hz):
             named = Share(sum(report.find(pipeline.tick)), model.size)
         force[k] = pipeline.tick.columns.force_n

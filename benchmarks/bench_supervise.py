@@ -237,7 +237,7 @@ def turned(known: bool) -> Rows:
         way = ways[0] * np.sin(speeds * t_s) + ways[1] * np.cos(speeds[::-1] * t_s)
         way /= np.linalg.norm(way)
         if known:
-            rig.tick.baseline.set_gravity(np.tile(way, (rig.model.size, 1)))
+            rig.tick.baseline.set_felt_gravity(np.tile(way, (rig.model.size, 1)))
         return np.asarray(by_gravity @ way)
 
     none = np.zeros(rig.model.size)
@@ -256,7 +256,7 @@ def slow(quick: bool) -> Rows:
         rig = Rig(hands(15), 72)
         model = rig.model
         per_law = (
-            model.begin_threshold_counts[0] / model.begin_threshold_n[0] ** 1.5
+            model.begin_threshold_counts[0] / model.touch.begin_threshold_n[0] ** 1.5
         )  # light contacts: the layer dominates
         none = np.zeros(model.size)
         for _ in range(round(10e9 / PERIOD_NS)):

@@ -66,8 +66,8 @@ def deployment_of(units: int) -> config.Deployment:
     return config.parse(text)
 
 
-def touches(model: PadModel, count: int, seed: int) -> Scenario:
-    """`count` contacts anywhere on every pad, 8 % of a side from its edges, of 0.5 to 5 N."""
+def touches(model: PadModel, count: int, seed: int, step_s: float = STEP_S, first_s: float = 0.0) -> Scenario:
+    """`count` contacts anywhere on every pad, 8 % of a side from its edges, of 0.5 to 5 N, `step_s` apart."""
     generator = np.random.default_rng(seed)
     made = []
     for number in range(count):
@@ -76,7 +76,7 @@ def touches(model: PadModel, count: int, seed: int) -> Scenario:
         made += [
             ScenarioTouch(
                 link=link,
-                from_s=number * STEP_S,
+                from_s=first_s + number * step_s,
                 duration_s=TICKS * PERIOD_NS * 1e-9,
                 ramp_s=0.005,
                 path=((float(x), float(y)),),

@@ -43,6 +43,7 @@ from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, options
 from benchmarks.scores import Estimates, EstimateScore, concatenate, slices
 from handtouch.calibration.auto_calibration import AutoCalibrator
+from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.active_calibration import ActiveCalibration
@@ -136,17 +137,17 @@ def learn(
     rest = np.lib.stride_tricks.sliding_window_view(padded, REST_PAUSES, axis=0).mean(axis=-1)
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     network = pad_network(pad, sheet)
-    others = models_with_other_parts(network, pad, node, sheet)
-    calibrator = AutoCalibrator(network, others, part_stds(pad, node, sheet), part_limits(pad, node))
+    parts = PartModels(models_with_other_parts(network, pad, node, sheet), part_limits(pad, node))
+    calibrator = AutoCalibrator(network, parts, part_stds(pad, node, sheet), node.gain_std)
     calibrator.assign_node(row + 1, None, None, "", 0)
-    noise_a = contact_noise_a(model, row)
+    noise_a, count = contact_noise_a(model, row), model.electrode_counts[row]
     found: list[Learning] = []
     applied, given = None, []
     for number, reading, zeros in zip(numbers, held, rest, strict=True):
         if reading.max() >= model.max_counts[row]:
             continue
         sync_ns = round((REST_S + number * STEP_S + SAMPLE_S) * 1e9)
-        currents_a = (reading - zeros) * model.ampere_per_count[row]
+        currents_a = (reading - zeros) * model.ampere_per_count[row, :count]
         given.append(number)
         if calibrator.add_contact(StationaryContact(currents_a, noise_a, HELD_SAMPLES, sync_ns)).apply:
             gains = calibrator.gains
@@ -163,8 +164,9 @@ def learn(
 
 
 def contact_noise_a(model: PadModel, row: int) -> FloatArray:
-    """Return the noise (4,) [A] of a contact's mean less its zeros."""
-    return np.asarray(model.noise_a[row] * np.sqrt(1 / HELD_SAMPLES + 1 / (REST_SAMPLES * REST_PAUSES)))
+    """Return the noise (channels,) [A] of a contact's mean less its zeros."""
+    noise_a = model.noise_a[row, : model.electrode_counts[row]]
+    return np.asarray(noise_a * np.sqrt(1 / HELD_SAMPLES + 1 / (REST_SAMPLES * REST_PAUSES)))
 
 
 def play(task: tuple[str, int, int, tuple[int, ...]]) -> dict[str, Estimates]:

@@ -1,23 +1,34 @@
 """The daemon's pipeline with its own settings, and its percept process in this one.
 
-Public names: `pipeline_of`; `decoded`, a message as a subscriber has it; `InlineProcess`, the percept
-process' worker in this process, so that a run is repeatable and as fast as it can be.
+Public names: `pipeline_of`, `lay_out_channels`, `write_counts`, `request_percepts`; `decoded`, a message as a
+subscriber has it; `InlineProcess`, the percept process' worker in this process, so that a run is repeatable
+and as fast as it can be.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from handtouch import wire
 from handtouch.config import Deployment
+from handtouch.config.roles import channel_count
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
+from handtouch.core.scene import RequestedOutputs
+from handtouch.core.slab import ChannelField
 from handtouch.core.tick_messages import MessageSink
 from handtouch.daemon.child_process import ChildProcess
+from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.hand.robot_models import RobotModels
 from handtouch.percept.messages import pack_message, unpack_input
 from handtouch.percept.worker import PerceptWorker
-from handtouch.wire import PadState
+from handtouch.wire import PERCEPT_KINDS, PadState
+
+_CHANNELS_OF_PDO = 4
 
 
 def pipeline_of(
@@ -39,6 +50,41 @@ def pipeline_of(
     )
     pipeline.node_state[:] = PadState.CLEAR
     return pipeline
+
+
+def lay_out_channels(pipeline: Pipeline, deployment: Deployment) -> None:
+    """Let each pad's node send its channels by 16 bits each, as many PDOs as they take."""
+    for pad, entry in enumerate(deployment.pads):
+        layout = (
+            ChannelField(k // _CHANNELS_OF_PDO, 16 * (k % _CHANNELS_OF_PDO), 16, True)
+            for k in range(channel_count(entry.pad))
+        )
+        pipeline.slab.set_layout(pad, tuple(layout))
+
+
+def write_counts(pipeline: Pipeline, pad: int, counts: NDArray[np.integer], arrival_ns: int) -> None:
+    """Let the sample (c,) of a pad arrive."""
+    for number, first in enumerate(range(0, len(counts), _CHANNELS_OF_PDO)):
+        data = counts[first : first + _CHANNELS_OF_PDO].astype("<i2").tobytes()
+        pipeline.slab.write_pdo(pad, data.ljust(8, b"\0"), arrival_ns, number)
+
+
+def request_percepts(
+    pipeline: Pipeline,
+    perceiving: PerceptPublisher,
+    kinds: Sequence[str],
+    now_ns: int = 0,
+    *,
+    palm: bool = False,
+) -> None:
+    """Request positions, forces and percepts of these kinds of all pads; palm: positions in the palm, too."""
+    every = np.ones(pipeline.model.size, np.bool_)
+    percepts = np.repeat(np.isin(PERCEPT_KINDS, kinds)[:, None], len(every), axis=1) if kinds else None
+    requested = RequestedOutputs(
+        every, every, np.ones(len(every), np.int64), every if palm else ~every, ~every, percepts
+    )
+    pipeline.apply_demand(requested)
+    perceiving.set_requested(requested, now_ns)
 
 
 def decoded(message: wire.OutgoingMessage) -> wire.Message:

@@ -16,20 +16,15 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from benchmarks.daemon_settings import InlineProcess, decoded, pipeline_of
-from handtouch import wire
-from handtouch.config import Deployment, Touch
-from handtouch.core.pad_model import PadModel
-from handtouch.core.scene import RequestedOutputs
-from handtouch.core.slab import ChannelField
-from handtouch.core.stages.kinematics import LinkPoses
-from handtouch.daemon.authentication import Authenticator
-from handtouch.daemon.inputs import InputReceiver
-from handtouch.daemon.percepts import PerceptPublisher
-from handtouch.hand.joints import JointStateBuffer
-from handtouch.hand.pads import mount_transform
-from handtouch.hand.robot_models import RobotModels
-from handtouch.simulate.grasp.event_score import (
+from benchmarks.daemon_settings import (
+    InlineProcess,
+    decoded,
+    lay_out_channels,
+    pipeline_of,
+    request_percepts,
+    write_counts,
+)
+from benchmarks.event_score import (
     EventScore,
     Span,
     compare_contacts,
@@ -37,6 +32,16 @@ from handtouch.simulate.grasp.event_score import (
     merge_spans,
     touch_spans,
 )
+from handtouch import wire
+from handtouch.config import Deployment, Touch
+from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.kinematics import LinkPoses
+from handtouch.daemon.authentication import Authenticator
+from handtouch.daemon.inputs import InputReceiver
+from handtouch.daemon.percepts import PerceptPublisher
+from handtouch.hand.joints import JointStateBuffer
+from handtouch.hand.pads import mount_transform
+from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate.grasp.grasp_objects import GraspObject
 from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
@@ -52,9 +57,7 @@ PARTS = ("pad", "mount", "kinematics", "time")
 _PERIOD_NS, _JOINTS_NS, _ARRIVES_NS = 5_000_000, 10_000_000, 2_000_000
 _START_NS = 1_000_000_000
 _PER_TICK = 5  # steps of MuJoCo
-_PDO_CHANNELS = 4
-_LAYOUT = tuple(ChannelField(k // _PDO_CHANNELS, 16 * (k % _PDO_CHANNELS), 16, True) for k in range(8))
-"""Of a pad with a shear pad: both in TPDOs of their own."""
+"""Of a pad with a shear pad or a second sheet: its channels are in two TPDOs."""
 
 
 def drawn_world(name: str, seed: int) -> DrawnWorld:
@@ -126,7 +129,7 @@ def served(
     virtual = VirtualHand(deployment, stimulus, world)
     steps = np.arange(0, len(grasp.times_s), _PER_TICK)
     times_s = np.asarray(steps * TIME_STEP_S, np.float64)
-    counts = [_readings(virtual, row, times_s) for row in range(len(hand.pads))]
+    counts = [virtual.all_counts(row, times_s) for row in range(len(hand.pads))]
     with zmq.Context() as context:
         run = _Run(deployment, context, grasp, world, perceive)
         for tick, step in enumerate(steps.tolist()):
@@ -136,13 +139,6 @@ def served(
     railed = sum(int((np.abs(of) >= 32767).any(axis=1).sum()) for of in counts)
     compared = _compared(deployment, grasp, patches, run, railed)
     return replace(compared, seed=seed, percepts_s=run.process.busy_s)
-
-
-def _readings(virtual: VirtualHand, row: int, times_s: FloatArray) -> NDArray[np.int64]:
-    """Return counts (n, c) of a pad at times (n,), followed by those of its shear pad."""
-    shear = virtual.virtual_pads[row].shear
-    own = virtual.counts(row, times_s)
-    return own if shear is None else np.hstack([own, shear.counts(times_s)])
 
 
 class _Run:
@@ -172,19 +168,11 @@ class _Run:
         )
         self.pipeline = pipeline_of(deployment, self, model=model, robots=robots, period_ns=_PERIOD_NS)
         self.pipeline.transforms.joints_at = self.inputs.joints_at
-        all_pads = np.ones(model.size, np.bool_)
-        requested = RequestedOutputs(all_pads, all_pads, np.ones(model.size, np.int64), all_pads, ~all_pads)
-        if perceive:
-            kinds = PERCEPT_KINDS if perceive is True else perceive
-            percepts = np.repeat(np.isin(PERCEPT_KINDS, kinds)[:, None], model.size, axis=1)
-            requested = requested._replace(percepts=percepts)
-        self.pipeline.apply_demand(requested)
-        for row, (_, pad) in enumerate(deployment.pads):
-            if pad.shear:
-                self.pipeline.slab.set_layout(row, _LAYOUT)
+        lay_out_channels(self.pipeline, deployment)
         self.process = InlineProcess(deployment)
         self._perceiving = PerceptPublisher(deployment, self.pipeline, self, process=self.process)
-        self._perceiving.set_requested(requested, _START_NS)
+        kinds = PERCEPT_KINDS if perceive is True else perceive
+        request_percepts(self.pipeline, self._perceiving, kinds, _START_NS, palm=True)
         self.contacts: list[wire.Contact] = []
         self.percepts: list[wire.Percept] = []
         self.used: dict[int, tuple[FloatArray, FloatArray]] = {}
@@ -209,9 +197,7 @@ class _Run:
         t_ns = _START_NS + since_ns
         self.pipeline.begin_cycle(t_ns, t_ns)
         for pad, now in enumerate(counts):
-            for pdo, first in enumerate(range(0, len(now), _PDO_CHANNELS)):
-                data = now[first : first + _PDO_CHANNELS].astype("<i2").tobytes()
-                self.pipeline.slab.write_pdo(pad, data, t_ns + 1, pdo)
+            write_counts(self.pipeline, pad, now, t_ns + 1)
         ticked = self.pipeline.tick_if_due(t_ns + 7 * _PERIOD_NS // 10)
         assert ticked is not None
         self._perceiving.process_tick(ticked, t_ns)

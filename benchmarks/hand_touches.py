@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.daemon_settings import decoded, pipeline_of
+from benchmarks.daemon_settings import decoded, lay_out_channels, pipeline_of, write_counts
 from benchmarks.oracle import PadOracle
 from benchmarks.scores import Estimates, bin_labels
 from handtouch import wire
 from handtouch.config import Deployment
+from handtouch.config.roles import channel_count
 from handtouch.core.pad_model import PadModel
-from handtouch.core.slab import ChannelField
-from handtouch.core.stages.shear import SHEAR_CHANNELS
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -73,29 +72,30 @@ def draw_touches(links: Sequence[str], count: int, seed: int) -> tuple[ScenarioT
 
 
 def serve(
-    model: PadModel, deployment: Deployment, counts: NDArray[np.int64], sampled: Mapping[int, int]
+    model: PadModel,
+    deployment: Deployment,
+    counts: NDArray[np.int64],
+    sampled: Mapping[int, int],
+    times_s: FloatArray | None = None,
 ) -> dict[tuple[int, str], wire.Contact]:
     """Return the contacts in the `sampled` ticks by touch number and link; counts (ticks, pads, c).
 
-    Those of a pad's shear pad follow its own.
+    Those of a pad's shear pad and its second sheet follow its own. times_s: (ticks,), by default a period
+    apart.
     """
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
+    since_ns = period_ns * np.arange(len(counts)) if times_s is None else np.round(1e9 * times_s)
+    stamps_ns = _FIRST_NS + since_ns.astype(np.int64)
     collector = Collector()
     pipeline = pipeline_of(deployment, collector, model=model)
-    channels = [len(electrodes) for electrodes in model.electrodes]
-    for shear in model.shear_pads:
-        channels[shear.pad] = shear.column + SHEAR_CHANNELS
-    for pad, own in enumerate(channels):
-        layout = tuple(ChannelField(k // 4, 16 * (k % 4), 16, True) for k in range(own))
-        pipeline.slab.set_layout(pad, layout)
-    for tick, rows in enumerate(counts.astype("<i2")):
-        t_ns = _FIRST_NS + tick * period_ns
+    lay_out_channels(pipeline, deployment)
+    channels = [channel_count(entry.pad) for entry in deployment.pads]
+    for tick, rows in enumerate(counts):
+        t_ns = int(stamps_ns[tick])
         collector.sampled = sampled.get(tick)
         pipeline.begin_cycle(t_ns, t_ns)
         for pad, row in enumerate(rows):
-            for number in range(-(-channels[pad] // 4)):
-                data = row[4 * number : 4 * number + 4].tobytes().ljust(8, b"\0")
-                pipeline.slab.write_pdo(pad, data, t_ns + 1, number)
+            write_counts(pipeline, pad, row[: channels[pad]], t_ns + 1)
         pipeline.tick_if_due(t_ns + period_ns)
         pipeline.prepare_next_tick()
     return collector.contacts
@@ -111,12 +111,13 @@ def sampled(hand: VirtualHand, model: PadModel, deployment: Deployment, numbers:
 class TouchReadings:
     """Counts (ticks, pads, c) of touches, c of the pad with most electrodes, and truths of their samples.
 
-    `sampled`: touch number by tick.
+    `sampled`: touch number by tick. `times_s`: (ticks,).
     """
 
     counts: NDArray[np.int64]
     sampled: Mapping[int, int]
     truths: dict[Key, GroundTruth]
+    times_s: FloatArray
 
     @classmethod
     def of_hand(cls, hand: VirtualHand, deployment: Deployment, numbers: range) -> TouchReadings:
@@ -124,25 +125,27 @@ class TouchReadings:
         period_s = deployment.daemon.sync_period_ms * 1e-3
         ticks = round((REST_S + numbers.stop * STEP_S) / period_s)
         times_s = np.asarray(period_s * np.arange(ticks), np.float64)
-        pads = [entry.pad for entry in deployment.pads]
-        made = [hand.counts(row, times_s) for row in range(len(pads))]
-        for row, virtual in enumerate(hand.virtual_pads):
-            if virtual.shear:
-                made[row] = np.hstack([made[row], virtual.shear.counts(times_s)])
+        at = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
+        return cls.at_times(hand, times_s, at)
+
+    @classmethod
+    def at_times(cls, hand: VirtualHand, times_s: FloatArray, sampled: Mapping[int, int]) -> TouchReadings:
+        """Return what a hand reads at these times (ticks,); sampled: touch number by tick."""
+        pads = hand.pads
+        made = [hand.all_counts(row, times_s) for row in range(len(pads))]
         counts = np.zeros((len(times_s), len(pads), max(own.shape[1] for own in made)), np.int64)
         for row, own in enumerate(made):
             counts[:, row, : own.shape[1]] = own
-        at = {round((REST_S + k * STEP_S + SAMPLE_S) / period_s): k for k in numbers}
         truths = {
             (k, truth.link): truth
-            for tick, k in at.items()
+            for tick, k in sampled.items()
             for truth in reversed(hand.truth(float(times_s[tick])))  # the first touch of those at once
         }
-        return cls(counts, at, truths)
+        return cls(counts, sampled, truths, times_s)
 
     def contacts(self, model: PadModel, deployment: Deployment) -> dict[Key, wire.Contact]:
         """Return the contacts at the samples, through the daemon's pipeline."""
-        return serve(model, deployment, self.counts, self.sampled)
+        return serve(model, deployment, self.counts, self.sampled, self.times_s)
 
 
 def compare(

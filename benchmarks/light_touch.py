@@ -81,6 +81,12 @@ class DetectionBench:
         self._slab = CountSlab(np.tile(np.array([-32768, 32767]), (size, self.model.channels, 1)))
         self._cycle, self._up = Cycle(period_ns, 0.6), np.zeros(size, np.uint8)
 
+    def tare(self, counts: CountArray) -> None:
+        """Set the baselines to the mean of samples (ticks, pads, channels) of all hands, as a tare does."""
+        baseline = self.tick.baseline
+        for pad, zeros in enumerate(counts.mean(axis=0)):
+            baseline.set_offset(pad, zeros, baseline.noise_counts[pad] / np.sqrt(len(counts)))
+
     def run_tick(self, counts: CountArray, sync_ns: int) -> TickResult:
         """Process a sample (pads, channels) of all hands."""
         self.tick.prepare_next_tick()
@@ -154,7 +160,7 @@ def tick_times(from_s: float, length_s: float, period_ns: int) -> list[FloatArra
 def measured_thresholds(hands: Sequence[QuietHand], period_ns: int) -> list[Thresholds]:
     """Return the least thresholds of hands, as `health` publishes them after ten untouched minutes."""
     bench = DetectionBench([shipped_thresholds()] * len(hands), period_ns)
-    scatter = LevelScatter(bench.model.begin_debounce_ns.tolist())
+    scatter = LevelScatter(bench.model.touch.begin_ms.tolist())
     for times_s in tick_times(START_S, MEASURED_S, period_ns):
         counts = np.concatenate([hand.counts(times_s) for hand in hands], axis=1)
         stamps = np.rint(times_s * 1e9).astype(np.int64)

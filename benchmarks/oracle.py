@@ -1,11 +1,11 @@
 """Least uncertainty that an estimator of contacts can honestly state in a simulated world.
 
-Public names: `PadOracle`, `OracleCovariances`.
+Public names: `PadOracle`, `OracleCovariances`; `Patches`, shapes of contacts that a world draws.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +15,17 @@ from benchmarks.scores import laplace_covariance
 from handtouch import config
 from handtouch.field import ContactLaw, Electrode, ElectrodeNetwork, Surface
 from handtouch.hand import pad_surface
+from handtouch.simulate.contact_patch import ContactPatch, Profile
+from handtouch.simulate.solved_contact import PatchNodes
+from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import DrawnWorld, HiddenPad
 
 FloatArray = NDArray[np.float64]
 _STEP = 1e-4
 """Of differences: of a side, or in the parameter's own unit."""
+_DIRECTIONS = 8
+_NEAREST = 1e-3
+"""Of a patch's position to an edge, in sides."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +51,50 @@ class _Hidden:
     radius_m: float = 0.0
     log_layer: float = 0.0
     alpha: float = 0.0
+    lead_ohm: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Shapes of contacts on a pad, all as likely, in any direction: their readings by the simulator.
+
+    A contact's centre of pressure and force are given; what its shape does to the currents isn't known.
+    """
+
+    hand: VirtualHand
+    row: int
+    radius_m: float
+    shapes: Sequence[tuple[Profile, float]]
+    """Profile and elongation."""
+
+    def covariances(self, place: FloatArray, force_n: FloatArray, gains: FloatArray) -> FloatArray:
+        """Return the covariances (n, c, c) [A^2] of the currents by shape of contacts at fractions of the
+        pad (2, n) with forces (n,)."""
+        angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS * 2
+        forms = [
+            ContactPatch(self.radius_m, elongation, float(angle), profile).column(np.ones(1))[:, 0]
+            for profile, elongation in self.shapes
+            for angle in angles
+        ]
+        n, k = len(force_n), len(forms)
+        patch = np.tile(np.array(forms).T, n)
+        target, force = np.repeat(place, k, axis=1), np.repeat(force_n, k)
+        shape, position = self.hand.virtual_pads[self.row].shape, target
+        for _ in range(2):  # over an edge, the centre of what presses on the pad is another one
+            centre = PatchNodes.of_patches(shape, position, patch).centres(shape, position)
+            position = np.clip(position + target - centre, _NEAREST, 1 - _NEAREST)
+        rows = np.full(n * k, self.row, np.intp)
+        currents = gains * self.hand.solve_contacts(rows, position, patch, force)
+        away = currents.reshape(n, k, -1)
+        away = away - away.mean(axis=1, keepdims=True)
+        return np.asarray(np.einsum("nki,nkj->nij", away, away) / k)
 
 
 class PadOracle:
     """Readings of a pad as a function of contact and hidden parameters, about the true ones.
 
     `learnt`: information (p, p) of earlier contacts about the hidden parameters, None without any.
+    `patches`: shapes of contacts, None: round and pressed on evenly.
     Nearer an edge than twice a contact's radius the currents are those of `ContactLaw`, whose spreading
     resistance has a lower limit there; the simulator's are up to a quarter larger.
     """
@@ -64,6 +108,7 @@ class PadOracle:
         noise_a: FloatArray,
         prior_std: dict[str, float],
         learnt: FloatArray | None = None,
+        patches: Patches | None = None,
     ) -> None:
         self.surface: Surface = pad_surface(pad)
         self.surface_name = type(pad.surface).__name__.lower()
@@ -71,7 +116,7 @@ class PadOracle:
         self.aspect = max(length_m, width_m) / min(length_m, width_m)
         self._pad, self._sheet, self._hidden = pad, sheet, hidden
         self._drive_v, self._noise_a, self._prior_std = drive_v, noise_a, prior_std
-        self._learnt = learnt
+        self._learnt, self._patches = learnt, patches
 
     @classmethod
     def build(
@@ -81,6 +126,7 @@ class PadOracle:
         hand: str,
         pad: config.Pad,
         noise_a: FloatArray,
+        patches: Patches | None = None,
     ) -> PadOracle:
         """Return the oracle of a pad in a drawn world, with that world's distributions for prior."""
         world, sheet = drawn.world, deployment.sheets[pad.sheet]
@@ -97,9 +143,10 @@ class PadOracle:
             "radius_m": 1e-3 * world.contacts.radius_sigma.std * sheet.contact_radius_std_mm,
             "log_layer": world.sheets.contact_ohm_ratio.std,
             "alpha": world.sheets.alpha_offset.std,
+            "lead_ohm": parts.lead_ohm.std,
         }
-        drive_v = deployment.nodes[pad.node].drive_v
-        return cls(pad, drawn.sheet(hand, pad, sheet), drawn.pad(hand, pad), drive_v, noise_a, prior_std)
+        drive_v, hidden = deployment.nodes[pad.node].drive_v, drawn.pad(hand, pad)
+        return cls(pad, drawn.sheet(hand, pad, sheet), hidden, drive_v, noise_a, prior_std, patches=patches)
 
     def edge_distance(self, u_m: FloatArray, v_m: FloatArray) -> FloatArray:
         """Return the distance (n,) from the nearest edge as a fraction of that side's own direction."""
@@ -114,14 +161,15 @@ class PadOracle:
         contacts: (3, k) true arc lengths [m] and forces [N]. noise_a: (4,) of the mean of its samples.
         """
         design, _ = self._design(*contacts)
-        whitened = design / noise_a[:, None]
+        whitened = self._whitened(design, noise_a, *contacts)
         contact = whitened[:, :, :3] / np.linalg.norm(whitened[:, :, :3], axis=1, keepdims=True)
         left_over = np.linalg.qr(contact, mode="complete").Q[:, :, 3]
         scores = np.einsum("nc,ncp->np", left_over, whitened[:, :, 3:])
         learnt = scores.T @ scores + (0.0 if self._learnt is None else self._learnt)
         return PadOracle(
-            self._pad, self._sheet, self._hidden, self._drive_v, self._noise_a, self._prior_std, learnt
-        )
+            self._pad, self._sheet, self._hidden, self._drive_v, self._noise_a, self._prior_std, learnt,
+            self._patches,
+        )  # fmt: skip
 
     def covariances(self, u_m: FloatArray, v_m: FloatArray, force_n: FloatArray) -> OracleCovariances:
         """Return covariances at true contacts: arc lengths (n,) [m] and forces (n,) [N]."""
@@ -129,12 +177,30 @@ class PadOracle:
         learnt = np.zeros((len(prior), len(prior)))
         if self._learnt is not None:
             learnt[3:, 3:] = self._learnt
-        full = laplace_covariance(design, self._noise_a, prior, learnt)
+        whitened = self._whitened(design, self._noise_a, u_m, v_m, force_n)
+        full = laplace_covariance(whitened, np.ones(design.shape[1]), prior, learnt)
         noise_only = laplace_covariance(design[:, :, :3], self._noise_a, prior[:3])
         metres = self._metres(u_m, v_m, len(prior))
         position = metres @ full @ np.swapaxes(metres, 1, 2)
         force = full[:, 2:3, 2:3] * (force_n**2)[:, None, None]
         return OracleCovariances(position, force, np.sqrt(noise_only[:, 2, 2]) * force_n)
+
+    def _whitened(
+        self,
+        design: FloatArray,
+        noise_a: FloatArray,
+        u_m: FloatArray,
+        v_m: FloatArray,
+        force_n: FloatArray,
+    ) -> FloatArray:
+        """Return derivatives (n, 4, p) of what noise and shapes of contacts vary by 1, independently."""
+        if self._patches is None:
+            return np.asarray(design / noise_a[:, None])
+        _, y = self.surface.to_rectangle(u_m, v_m)
+        place = np.stack([u_m / self.surface.extent_m[0], y / self.surface.b])
+        gains = np.array(self._hidden.gain_ratio)
+        covariance = self._patches.covariances(place, force_n, gains) + np.diag(noise_a**2)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), design))
 
     def _design(
         self, u_m: FloatArray, v_m: FloatArray, force_n: FloatArray
@@ -195,7 +261,7 @@ class PadOracle:
         x, y, log_force = contact
         stretch = np.exp(hidden.log_length - hidden.log_width + hidden.log_anisotropy / 2)
         sheet_ohm = self._sheet.ohm_per_square * np.exp(hidden.log_sheet)
-        network = self._network(stretch, sheet_ohm, hidden.gap_m)
+        network = self._network(stretch, sheet_ohm, hidden)
         at = stretch * x, y
         fractions = network.fractions(*at)
         law = ContactLaw(
@@ -210,10 +276,10 @@ class PadOracle:
         gains = np.array(self._hidden.gain_ratio) * np.exp(hidden.log_gain)
         return np.asarray(gains[:, None] * total * fractions)
 
-    def _network(self, stretch: float, sheet_ohm: float, gap_m: tuple[float, ...]) -> ElectrodeNetwork:
+    def _network(self, stretch: float, sheet_ohm: float, hidden: _Hidden) -> ElectrodeNetwork:
         """Return the pad's network with its true gaps and these differences, before and after by side."""
         surface = self.surface
-        shifts = np.reshape(gap_m, (2, 4))
+        shifts = np.reshape(hidden.gap_m, (2, 4))
         true_m = 1e-3 * np.array([self._hidden.gap_before_mm, self._hidden.gap_after_mm])
         before, after = np.maximum(true_m + shifts, 0.0)
         length_m = surface.extent_m[0]
@@ -225,6 +291,7 @@ class PadOracle:
         for number, side in enumerate(("y0", "yb"), 2):
             ends, _ = surface.to_rectangle([before[number], length_m - after[number]], [0.0, 0.0])
             electrodes.append(Electrode(side, float(stretch * ends[0]), float(stretch * ends[1])))  # type: ignore[arg-type]
+        series_ohm = np.maximum(np.add(self._hidden.series_ohm, hidden.lead_ohm), 0.0)
         return ElectrodeNetwork.from_sides(
-            stretch * surface.a, surface.b, electrodes, sheet_ohm, self._hidden.series_ohm
+            stretch * surface.a, surface.b, electrodes, sheet_ohm, tuple(series_ohm.tolist())
         )

@@ -21,7 +21,8 @@ ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
     "diagnose", "worlds", "contacts", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
-    "swap", "shear_slip", "estimate", "percept_grasp", "object", "shear", "design", "switched", "shape",
+    "swap", "shear_slip", "stability", "estimate", "percept_grasp", "object", "shear", "design", "switched",
+    "shape",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside); the
 longest first, so that none of them is the last for long."""

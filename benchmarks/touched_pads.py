@@ -124,19 +124,20 @@ class PipelineCase:
 
 
 def in_turns_of(cases: dict[str, PipelineCase], touches: Touches, ticks: int) -> list[dict[str, Any]]:
-    """Run cases by turns on the same samples; return the median microseconds and bytes of a tick of each."""
+    """Run cases by turns on the same samples; return the median microseconds and bytes of a tick of each, and
+    quartiles and median of its ratio to the first case in the same tick."""
     order: Sequence[PipelineCase] = list(cases.values())
     for number in range(ticks + WARM_UP):
         t_ns, counts = 10**9 + number * PERIOD_NS, touches.counts()
         for case in [*order[number % len(order) :], *order[: number % len(order)]]:
             case.tick(t_ns, counts)
-    spent_us = {name: float(np.median(case.spent_ns[WARM_UP:])) * 1e-3 for name, case in cases.items()}
+    spent_us = {name: 1e-3 * np.array(case.spent_ns[WARM_UP:]) for name, case in cases.items()}
     first_us = next(iter(spent_us.values()))
     return [
         {
             "case": name,
-            "us a tick": us,
-            "of the first, %": 100 * us / first_us,
+            "us a tick": float(np.median(us)),
+            "of everything on, %": (100 * np.percentile(us / first_us, [25, 50, 75])).tolist(),
             "bytes a tick": cases[name].sent_bytes / cases[name].pipeline.ticks,
         }
         for name, us in spent_us.items()

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from benchmarks import bench_percept_grasp as scored
 from benchmarks import bench_slip, grasp_run
 from benchmarks.bench_slip import PerceptCollector
-from benchmarks.daemon_settings import InlineProcess, pipeline_of
+from benchmarks.daemon_settings import InlineProcess, pipeline_of, request_percepts
+from benchmarks.grip_touch import GripTouch
 from benchmarks.page import ROOT, progress
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.columns import TickResult
 from handtouch.core.pad_model import PadModel
-from handtouch.core.scene import RequestedOutputs
 from handtouch.core.stages.evidence import (
     ALONE_LOG_ODDS,
     MAX_OTHERS_LOG_ODDS,
@@ -39,11 +39,9 @@ from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 from handtouch.percept.slip_evidence import SlipEvidence, SlipTrees
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
-from handtouch.simulate.grip_touch import GripTouch
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
-from handtouch.wire import PERCEPT_KINDS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -215,13 +213,7 @@ def process(touches: list[GripTouch], world: DrawnWorld, seconds: float, noise_d
     pipeline = pipeline_of(described, sink, model=model, robots=robots, period_ns=round(1e9 * _PERIOD_S))
     pipeline.transforms.joints_at = resting_joints(len(robots.joint_names[0]), noise_deg, seed)
     recorder = Recorder(described, pipeline, sink, process=InlineProcess(described))
-    every = np.ones(model.size, np.bool_)
-    percepts = np.zeros((len(PERCEPT_KINDS), model.size), np.bool_)
-    percepts[PERCEPT_KINDS.index("motion")] = True
-    requested = RequestedOutputs(every, every, np.ones(model.size, np.int64), every, ~every)
-    requested = requested._replace(percepts=percepts)
-    pipeline.apply_demand(requested)
-    recorder.set_requested(requested, 0)
+    request_percepts(pipeline, recorder, ["motion"], palm=True)
     for k, t_s in enumerate(times_s.tolist()):
         t_ns = _START_NS + round(t_s * 1e9)
         pipeline.begin_cycle(t_ns, t_ns)

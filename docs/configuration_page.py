@@ -49,6 +49,7 @@ The file of `handtouch node` ([a node on Linux](node.md)); `trim` names a file o
 """
 UNITS = {
     "n_per_mm": "N/mm",
+    "signal_per_n": "unit/N",
     "bit_s": "bit/s",
     "ohm_per_square": "Ω per square",
     "ohm_mm2": "Ω mm²",
@@ -75,9 +76,15 @@ KIND_TITLES = {
     "surface": "Surfaces",
     "pattern": "Shear patterns",
     "shape": "Shapes of objects",
+    "response": "`[response.NAME]`",
     "source": "`[source.NAME]`",
 }
-KIND_ANCHORS = {"surface": "surfaces", "pattern": "shear-patterns", "shape": "shapes-of-objects"}
+KIND_ANCHORS = {
+    "response": "responsename",
+    "surface": "surfaces",
+    "pattern": "shear-patterns",
+    "shape": "shapes-of-objects",
+}
 TITLES = {"": "Keys before the first table", "trim file": "Trim file"}
 TYPES = {str: "text", bool: "`true`, `false`", int: "integer", float: "number"}
 
@@ -118,7 +125,7 @@ def _range(annotation: Any, metadata: list[Any]) -> str:
     if origin is Literal:
         return ", ".join(f"`{choice}`" for choice in arguments)
     if origin in (Union, types.UnionType):
-        return " or ".join(TYPES[choice] for choice in arguments)
+        return " or ".join(_range(choice, []) for choice in arguments)
     if origin is dict:
         return f"table of {_plural(_range(arguments[1], []))}"
     if origin is tuple:
@@ -216,7 +223,9 @@ def _shipped() -> dict[tuple[str, str], Any]:
             named = f"{path}.*" in names
             entries = value if isinstance(value, list) else list(value.values()) if named else [value]
             if key in tables.KINDS:
-                add(value["kind"], value, {})
+                kinds = [value] if "kind" in value else value.values() if isinstance(value, dict) else []
+                for entry in kinds:
+                    add(entry["kind"], entry, {})
             elif key in settings.KINDS and table == NODE_FILE:
                 for entry in value.values():
                     add(entry["kind"], entry, {})
@@ -317,7 +326,8 @@ def page() -> Iterator[str]:
     yield DEPLOYMENT.strip()
     yield from _sections(tables.TABLES, "", {"bus", "hand", "hand.pad"})
     for key, models in tables.KINDS.items():
-        yield from _kinds(key, f"`{key} = {{ kind = ... }}`", models)
+        head = "Tables of pads that aren't sheets with electrodes, see [responses](responses.md)"
+        yield from _kinds(key, head if key == "response" else f"`{key} = {{ kind = ... }}`", models)
     yield NODE
     yield from _sections(settings.TABLES, NODE_FILE, {"pad"})
     for key, models in settings.KINDS.items():

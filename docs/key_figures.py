@@ -19,7 +19,13 @@ from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parent / "benchmarks"
 WORLDS = ("ideal", "default", "harsh")
-BLUE, ORANGE, GREEN, GREY = "#0072b2", "#d55e00", "#009e73", "#8a8a8a"  # distinct with colour blindness
+BLUE, ORANGE, GREEN, GREY, PURPLE = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#8a8a8a",
+    "#aa5fa0",
+)  # distinct with colour blindness
 STYLE = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -34,12 +40,13 @@ def draw_all(folder: Path) -> None:
     """Write one SVG per figure into `folder`, created if missing."""
     folder.mkdir(parents=True, exist_ok=True)
     figures: dict[str, Callable[[Axes], None]] = {
+        "methods": draw_methods,
+        "methods_force": draw_methods_force,
         "position": draw_position,
         "coverage": draw_coverage,
         "latency": draw_latency,
         "tick": draw_tick,
         "bus": draw_bus,
-        "methods": draw_methods,
         "slip": draw_slip,
         "diagnosis": draw_diagnosis,
         "swap": draw_swap,
@@ -138,45 +145,59 @@ def draw_tick(axes: Axes) -> None:
 
 
 def draw_bus(axes: Axes) -> None:
-    """Load of the CAN bus of 15 pads, by sampling."""
-    loads: dict[str, list[float]] = defaultdict(list)
-    for row in table("idle", "Load"):
-        loads[row["scene"]].append(number(row["bus load, %"]))
-    axes.barh(list(loads), [max(values) for values in loads.values()], color=GREY, label="most")
-    bars = axes.barh(
-        list(loads), [min(values) for values in loads.values()], color=BLUE, label="all untouched"
-    )
+    """Load of the CAN bus of 15 pads, by scene."""
+    loads = {
+        row["case"]: number(row["bus load, %"])
+        for row in table("skipping", "Hand (least, median, greatest)")
+        if "bare loop" not in row["case"]
+    }
+    bars = axes.barh(list(loads), list(loads.values()), color=BLUE)
     axes.bar_label(bars, fmt="%.0f %%", padding=3)
     axes.set(xlabel="load of a 1 Mbit/s bus, 15 pads at 200 Hz, %")
-    axes.set_yticks(range(len(loads)), [name.replace(", ", ",\n") for name in loads])
+    axes.set_yticks(range(len(loads)), [name.replace(", ", ",\n") for name in loads], fontsize=7)
     axes.invert_yaxis()
-    axes.legend(frameon=False, loc="lower right")
 
 
-def draw_methods(axes: Axes) -> None:
-    """Run time against error of ways to locate a contact on an ideal pad."""
+def draw_methods(axes: Axes, column: str = "position rms, mm", label: str = "rms position error, mm") -> None:
+    """Run time against error of the ways from four currents to a contact, in the world `default`."""
     kinds = {
-        "paper": (GREY, "the paper's"),
-        "instead": (ORANGE, "common alternatives"),
-        "handtouch": (BLUE, "handtouch.field"),
-        "core": (GREEN, "in the daemon"),
+        "paper": (GREY, "the paper's formulas"),
+        "common": (ORANGE, "common alternatives"),
+        "labelled": (PURPLE, "learned from 16 to 512 labelled presses"),
+        "theory": (BLUE, "exact theory"),
+        "core": (GREEN, "handtouch, no labels"),
     }
-    rows = table("methods", "Ideal pad")
-    for kind, (colour, label) in kinds.items():
-        points = [
-            (number(row["us each, 15 in a call"]), number(row["rms, mm"]))
-            for row in rows
-            if row["kind"] == kind
-        ]
-        axes.plot(*zip(*points, strict=True), "o", color=colour, label=label)
-    axes.set(
-        xscale="log", yscale="log", xlabel="us per contact, 15 at once", ylabel="rms error without noise, mm"
+    rows = table("methods", "World default")
+    for kind, (colour, name) in kinds.items():
+        own = [row for row in rows if row["kind"] == kind]
+        points = [(number(row["us each, 15 in a call"]), number(row[column])) for row in own]
+        size = 110 if kind == "core" else 30
+        marker = "*" if kind == "core" else "o"
+        us, errors = zip(*points, strict=True)
+        axes.scatter(us, errors, s=size, marker=marker, color=colour, label=name, zorder=3)
+    for learner in ("polynomial", "Gaussian process", "neural network"):
+        own = [row for row in rows if row["way"].startswith(learner)]
+        line = [(number(row["us each, 15 in a call"]), number(row[column])) for row in own]
+        axes.plot(*zip(*line, strict=True), "-", color=PURPLE, linewidth=0.8)
+        axes.annotate(learner, line[0], xytext=(5, 4), textcoords="offset points", color=PURPLE, fontsize=7)
+    (floor,) = (
+        number(row[column])
+        for row in table("methods", "Floors")
+        if row["case"] == "world default" and row["cause"] == "tolerances and noise"
     )
-    axes.axhline(
-        number(table("methods", "Floors, mm")[0]["noise of the channels"]), color=GREY, linestyle="--"
-    )
-    axes.text(0.99, 0.86, "noise of the channels", transform=axes.transAxes, ha="right", color=GREY)
-    axes.legend(frameon=False, loc="lower right", fontsize=8)
+    axes.axhline(floor, color=GREY, linewidth=1, linestyle="--")
+    axes.annotate("least possible without labels", (0.99, floor), xycoords=("axes fraction", "data"),
+                  xytext=(0, 3), textcoords="offset points", ha="right", color=GREY, fontsize=8)  # fmt: skip
+    axes.set(xscale="log", yscale="log", xlabel="us per contact, 15 at once", ylabel=label)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(lambda y, _: f"{y:g}" if f"{y:e}"[0] in "235" else "")
+    axes.legend(frameon=False, fontsize=7, loc="upper right")
+
+
+def draw_methods_force(axes: Axes) -> None:
+    """The same for forces."""
+    draw_methods(axes, "force rms, %", "rms force error, %")
 
 
 def draw_slip(axes: Axes) -> None:

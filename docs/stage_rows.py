@@ -29,5 +29,7 @@ def rows_pxd() -> str:
 
 def _members(row: np.dtype[np.void]) -> Iterator[str]:
     for name in row.names or ():
+        if hasattr(np.record, name):
+            raise ValueError(f"{name}: numpy's records have an attribute of that name")
         base, shape = row[name].base, row[name].shape
-        yield f"    {_TYPES[base.str]}{list(shape) if shape else ''} {name}"
+        yield f"    {_TYPES[base.str]} {name}{''.join(f'[{count}]' for count in shape)}"

@@ -1,6 +1,6 @@
 """Tables of docs/wire.md and the text of docs/wire.schema.json, from the declarations of the payloads.
 
-Public names: `with_tables`, `schema_text`.
+Public names: `with_tables`, `schema_text`, `STATUS_HEADS` (kinds of status by their keys).
 
 The page marks each table by a comment: `<!-- table: NAME -->` with `topics`, `internal topics`,
 `status codes` or the name of a class; `required` or `optional` after it selects the keys that are always
@@ -26,17 +26,25 @@ from handtouch.wire.declarations import (
 )
 from handtouch.wire.inputs import INPUT_TOPICS
 from handtouch.wire.schema import json_schema
-from handtouch.wire.status import ForceStatus, FrameStatus, PadState, PositionStatus
+from handtouch.wire.status import (
+    ContactRadiusStatus,
+    ForceStatus,
+    FrameStatus,
+    PadState,
+    PositionStatus,
+    StatusCode,
+)
 from handtouch.wire.topics import INTERNAL_TOPICS, TOPICS, Topic
 
 _TABLE = re.compile(r"(?<=<!-- table: )([\w ]+?)(?: (required|optional))?( -->\n)(?:\|.*\n)*")
 _ENVELOPE = ("v", "session", "seq", "t_ns", "retained")
 _TYPES = {int: "int", float: "float", str: "str", bool: "bool", bytes: "bin", Any: "any"}
-_STATUS_HEADS: dict[str, type[PadState | PositionStatus | ForceStatus | FrameStatus]] = {
+STATUS_HEADS: dict[str, type[StatusCode]] = {
     "`state` of a pad": PadState,
     "`position_status`": PositionStatus,
     "`force_status`": ForceStatus,
     "`palm_status`, `base_status`": FrameStatus,
+    "`contact_radius_status`": ContactRadiusStatus,
 }
 
 
@@ -58,7 +66,7 @@ def _table(name: str, selection: str | None) -> str:
     if name == "internal topics":
         return _format_table(("topic", "sent", "time in `t_ns`"), _topic_rows(INTERNAL_TOPICS))
     if name == "status codes":
-        return _format_table(("code", *_STATUS_HEADS), _status_rows())
+        return _format_table(("code", *STATUS_HEADS), _status_rows())
     rows = (
         (
             f"`{field.name}`{'?' if field.is_optional and selection is None else ''}",
@@ -84,7 +92,7 @@ def _topic_rows(topics: Sequence[Topic]) -> Iterator[Sequence[str]]:
 
 
 def _status_rows() -> Iterator[Sequence[str]]:
-    names = [[code.text for code in codes] for codes in _STATUS_HEADS.values()]
+    names = [[code.text for code in codes] for codes in STATUS_HEADS.values()]
     for number, row in enumerate(zip_longest(*names)):
         yield str(number), *("" if name is None else f"`{name}`" for name in row)
 

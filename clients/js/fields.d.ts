@@ -4,10 +4,12 @@ export type PadState = "clear" | "touched" | "stale" | "lost" | "faulted" | "sta
 export type PositionStatus = "not_computed" | "valid" | "unreliable" | "invalid";
 export type ForceStatus = "not_computed" | "valid" | "lower_bound" | "unreliable" | "invalid";
 export type FrameStatus = "not_computed" | "valid" | "stale" | "invalid";
+export type ContactRadiusStatus = "not_computed" | "valid" | "assumed" | "contradictory";
 export const PAD_STATES: readonly PadState[];
 export const POSITION_STATUSES: readonly PositionStatus[];
 export const FORCE_STATUSES: readonly ForceStatus[];
 export const FRAME_STATUSES: readonly FrameStatus[];
+export const CONTACT_RADIUS_STATUSES: readonly ContactRadiusStatus[];
 
 /** One of two contacts at once on a pad of six or more electrodes. */
 export interface ContactPart {
@@ -155,6 +157,29 @@ export interface Contact extends Envelope {
   /** part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
    *  the pad, so that the difference of two positions has the rest */
   mount_covariance_m2?: number[] | null;
+  /** status of the two that follow */
+  contact_radius_status?: ContactRadiusStatus;
+  /** radius of the contact, of a disc as large: estimated with the force on a pad with two sheets, else that
+   *  which `force_n` is for */
+  contact_radius_m?: number | null;
+  /** standard deviation of `contact_radius_m` */
+  contact_radius_std_m?: number | null;
+  /** length of the line that is as elongated: 0 of a round contact, of a rectangle the root of the difference
+   *  of its sides' squares. On a pad of four electrodes that of the shortest line that explains the currents,
+   *  along `length_axis`; this and the four that follow are absent where they aren't known, as with `parts`
+   *  */
+  length_m?: number | null;
+  /** lower end of the interval of 95 % of `length_m` */
+  min_length_m?: number | null;
+  /** upper end of that interval; absent on a pad of four electrodes, which show one combination of length and
+   *  direction */
+  max_length_m?: number | null;
+  /** unit vector along the contact, of either sign, in the link's frame; absent if the currents are those of
+   *  a round one */
+  length_axis?: number[] | null;
+  /** standard deviation of its direction in the pad's plane; 0.45 on a pad of four electrodes: within 45
+   *  degrees */
+  length_axis_std_rad?: number | null;
 }
 
 /** Columns of `hand/<hand>`, a row for each link; NaN where unknown. */
@@ -224,10 +249,28 @@ export interface Columns {
   /** part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
    *  the pad, so that the difference of two positions has the rest */
   mount_covariance_m2?: Float32Array;
+  /** status of the contact's radius */
+  contact_radius_status?: Uint8Array;
+  /** radius of the contact */
+  contact_radius_m?: Float32Array;
+  /** its standard deviation */
+  contact_radius_std_m?: Float32Array;
+  /** length of the line that is as elongated; NaN where nothing is known of it */
+  length_m?: Float32Array;
+  /** lower end of its interval of 95 % */
+  min_length_m?: Float32Array;
+  /** upper end of its interval of 95 % */
+  max_length_m?: Float32Array;
+  /** unit vector along it, in the link's frame */
+  length_axis?: Float32Array;
+  /** standard deviation of its direction */
+  length_axis_std_rad?: Float32Array;
 }
 export type Scalars = "state" | "contact_id" | "total_current_a" | "position_status" | "force_n" |
   "force_std_n" | "force_status" | "residual" | "residual_std" | "group" | "palm_status" | "base_status" |
-  "joints_age_s" | "force_vector_status";
+  "joints_age_s" | "force_vector_status" | "contact_radius_status" | "contact_radius_m" | "contact_radius_std_m"
+  | "length_m" | "min_length_m" | "max_length_m" | "length_axis_std_rad";
 export type Vectors = "position_m" | "normal" | "covariance_m2" | "pad_m" | "palm_position_m" | "palm_normal"
   | "palm_covariance_m2" | "base_position_m" | "base_normal" | "base_covariance_m2" | "force_vector_n" |
-  "force_vector_covariance_n2" | "palm_force_vector_n" | "base_force_vector_n" | "mount_covariance_m2";
+  "force_vector_covariance_n2" | "palm_force_vector_n" | "base_force_vector_n" | "mount_covariance_m2" |
+  "length_axis";

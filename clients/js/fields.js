@@ -4,6 +4,7 @@ export const PAD_STATES = ["clear", "touched", "stale", "lost", "faulted", "star
 export const POSITION_STATUSES = ["not_computed", "valid", "unreliable", "invalid"];
 export const FORCE_STATUSES = ["not_computed", "valid", "lower_bound", "unreliable", "invalid"];
 export const FRAME_STATUSES = ["not_computed", "valid", "stale", "invalid"];
+export const CONTACT_RADIUS_STATUSES = ["not_computed", "valid", "assumed", "contradictory"];
 
 /** Columns of hand frames: type of the array, elements in a row. */
 export const REQUIRED_COLUMNS = {
@@ -39,4 +40,12 @@ export const OPTIONAL_COLUMNS = {
   palm_force_vector_n: [Float32Array, 3],
   base_force_vector_n: [Float32Array, 3],
   mount_covariance_m2: [Float32Array, 9],
+  contact_radius_status: [Uint8Array, 1],
+  contact_radius_m: [Float32Array, 1],
+  contact_radius_std_m: [Float32Array, 1],
+  length_m: [Float32Array, 1],
+  min_length_m: [Float32Array, 1],
+  max_length_m: [Float32Array, 1],
+  length_axis: [Float32Array, 3],
+  length_axis_std_rad: [Float32Array, 1],
 };

@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from handtouch.calibration.calibration import Gains, matrix
 from handtouch.calibration.contact_scores import fisher_covariance, gain_deviation
 from handtouch.calibration.gains import (
     BATCH_CONTACTS,
     MAX_TOUCH_ERROR,
     GainEstimator,
     GainStatus,
+    PartModels,
 )
 from handtouch.field import Electrode, ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
@@ -247,7 +249,7 @@ def test_estimation_continues_from_stored_gains() -> None:
     first = plain()
     first.add_contacts(contacts(SQUARE, 320, 1e-3), 1e-3, 0)
     found = first.estimate
-    second = plain(start=found.gains, covariance=found.covariance)
+    second = plain(known=Gains(tuple(found.gains.tolist()), matrix(found.covariance)))
     np.testing.assert_allclose(second.estimate.gains, found.gains, rtol=1e-12)
     np.testing.assert_allclose(second.estimate.covariance, found.covariance, rtol=1e-6, atol=1e-12)
     second.add_contacts(contacts(SQUARE, 320, 1e-3, seed=2), 1e-3, 5)
@@ -280,8 +282,7 @@ def test_any_currents_give_finite_estimates(readings: list[list[float]]) -> None
         ({"model_error": -1.0}, "model_error"),
         ({"drift_per_day": float("nan")}, "drift_per_day"),
         ({"required_std": 0.0}, "required_std"),
-        ({"start": (1.0, 1.0, 1.0)}, "must be 4 positive"),
-        ({"start": (1.0, 1.0, 1.0, 0.0)}, "must be 4 positive"),
+        ({"known": Gains((1.0, 1.0, 1.0), matrix(np.eye(3)))}, "must be 4 positive"),
     ],
 )
 def test_invalid_parameters_are_refused_by_name(options: dict[str, Any], message: str) -> None:
@@ -309,7 +310,7 @@ def test_gains_of_pads_with_other_gaps_are_within_their_covariance() -> None:
         gaps = generator.normal(size=8)
         readings = contacts(with_gaps(0.1 * gaps), 64, 1e-4, seed=number)
         for known in (False, True):
-            estimator = plain(nominal, parts=parts if known else ())
+            estimator = plain(nominal, parts=PartModels(parts if known else ()))
             estimator.add_contacts(readings, 1e-4, 0)
             found = estimator.estimate
             error = np.log(found.gains) - TRUTH
@@ -332,7 +333,7 @@ def test_leads_are_found_however_large_and_as_certain_as_before_where_they_are_a
     readings = readings + 2e-4 * readings.sum(axis=0) * rng.normal(size=readings.shape)  # of patches
     found = {}
     for limit in (1.0, 20.0):
-        estimator = plain(nominal, parts=parts, part_limits=limit)
+        estimator = plain(nominal, parts=PartModels(parts, limit))
         estimator.add_contacts(readings, 1e-4, 0)
         found[limit] = estimator.estimate
     error = np.log(found[20.0].gains) - TRUTH, found[20.0].part_offsets - np.array(leads_ohm) / stated_ohm
@@ -346,6 +347,39 @@ def test_leads_are_found_however_large_and_as_certain_as_before_where_they_are_a
         assert found[20.0].widening > 5
         unknown = np.log(found[1.0].gains) - TRUTH
         assert unknown @ np.linalg.pinv(found[1.0].covariance, rcond=1e-6) @ unknown > 24
+
+
+def test_what_contacts_do_not_tell_of_gains_is_known_as_stated() -> None:
+    """Those of a long pad change currents as positions do."""
+    model, distances, stds = Rectangle(3.0, 1.0), [], []
+    for seed in range(20):
+        log_gains = np.random.default_rng(seed).normal(0, 0.01, 4)
+        log_gains -= log_gains.mean()
+        read = contacts(model, 64, 1e-3, log_gains, seed)
+        stated, unknown = plain(model, gain_std=0.01), plain(model)
+        for estimator in (stated, unknown):
+            estimator.add_contacts(read, 1e-3, 0)
+        found = stated.estimate
+        assert found.std < unknown.estimate.std
+        stds.append(found.std)
+        error = np.log(found.gains) - log_gains
+        distances.append(error @ np.linalg.pinv(found.covariance, rcond=1e-6) @ error)
+    assert 1.6 < np.mean(distances) < 5.0  # 99.8 % of means of 20 chi squared of three degrees of freedom
+    assert np.median(stds) < 0.012
+
+
+@pytest.mark.parametrize("wrong", [0.05, 0.1, 0.3])
+def test_gains_beyond_what_is_stated_are_found(wrong: float) -> None:
+    log_gains = wrong * np.array([0.75, -0.25, -0.25, -0.25])
+    distances = []
+    for seed in range(10):
+        estimator = plain(gain_std=0.01, tolerance=0.2)
+        estimator.add_contacts(contacts(SQUARE, 64, 1e-3, log_gains, seed), 1e-3, 0)
+        found = estimator.estimate
+        error = np.log(found.gains) - log_gains
+        distances.append(error @ np.linalg.pinv(found.covariance, rcond=1e-6) @ error)
+    assert np.mean(distances) < 6.0
+    assert found.std < 0.01
 
 
 def test_errors_of_each_touch_are_estimated_and_widen_the_covariance() -> None:

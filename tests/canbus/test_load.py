@@ -26,3 +26,11 @@ def test_fifteen_pads_at_500_hz_fill_a_bus_and_need_two_at_1_khz() -> None:
 
 def test_burst_of_a_hand_takes_two_milliseconds() -> None:
     assert burst_s(1e6, 15) == pytest.approx(55e-6 + 15 * 135e-6)
+
+
+def test_second_tpdos_add_their_frames() -> None:
+    further = 15 * frame_bits(2)
+    assert bus_load(1e6, 15, 0.005, 0.1, further) == pytest.approx(
+        bus_load(1e6, 15, 0.005, 0.1) + further / 0.005 / 1e6
+    )
+    assert burst_s(1e6, 15, further) > burst_s(1e6, 15)

@@ -137,18 +137,20 @@ def test_the_absence_of_a_daemon_is_logged_once(
             case "latest":
                 assert _until(lambda: hand.latest() is not None or bool(_warnings(caplog)))
             case "subscriber":
-                assert contacts.recv(0.3) is None
-                assert contacts.recv(0.3) is None
+                assert _until(lambda: contacts.recv(0.1) is not None or bool(_warnings(caplog)))
             case "asyncio":
                 assert asyncio.run(contacts.arecv(0.3)) is None
     assert _warnings(caplog) == [f"no daemon at {endpoint}; start `handtouch run FILE`"]
 
 
-def test_another_kind_of_endpoint_is_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_another_kind_of_endpoint_is_named(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "SILENCE_S", 1.0)  # until then, a busy machine has refused the connection
     with zmq.Context() as context, context.socket(zmq.ROUTER) as control, context.socket(zmq.XPUB) as live:
         ports = [socket.bind_to_random_port("tcp://127.0.0.1") for socket in (control, live)]
         with handtouch.connect(endpoint=f"tcp://127.0.0.1:{ports[0]}") as contacts:
-            assert contacts.recv(0.3) is None
+            assert _until(lambda: contacts.recv(0.1) is not None or bool(_warnings(caplog)))
         with pytest.raises(TimeoutError, match="takes no requests, perhaps it is a stream"):
             handtouch.request("status", endpoint=f"tcp://127.0.0.1:{ports[1]}", timeout_s=0.5)
     assert [re.findall(r"is no stream of messages", text) for text in _warnings(caplog)] == [

@@ -19,6 +19,7 @@ from scipy.interpolate import CubicSpline
 
 from handtouch import config
 from handtouch.config import ConfigError, shipped
+from handtouch.field.embedded_file import read_embedded
 
 CONFIG = Path(__file__).parents[2] / "config"
 SMALL = """
@@ -87,8 +88,11 @@ def test_shipped_deployments_are_valid(path: Path) -> None:
         "switched": 2,
         "outlined": 3,
         "shear": 2,
+        "two_sheets": 2,
         "l_palm": 1,
         "fingertip": 1,
+        "taxels": 2,
+        "two_layers": 2,
     }.get(path.stem, 15)
     assert [len(hand.pads) for hand in deployment.hands] == [pads]
 
@@ -428,6 +432,27 @@ def test_errors_of_shear_pads_name_location_value_and_remedy(change: tuple[str, 
     assert expected in config_error(text.replace(*change, 1))
 
 
+SECOND_SHEET_ERRORS = {
+    "no such sheet": (('second_sheet = "even"', 'second_sheet = "evn"'), 'did you mean "even"?'),
+    "equal alphas": (("alpha = 1.0", "alpha = 1.4"), "they must differ by 0.2 or more"),
+    "no channel for it": (
+        (', "0x6401:5"', ""),
+        'node = "five_channel": has 4 channels, the pad 4 electrodes and its second sheet 1; list as many',
+    ),
+    "measured film": (
+        ('second_sheet = "even"', 'second_sheet = "even"\nresistance_map = "film.npz"'),
+        "isn't supported together with resistance_map",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "expected"), SECOND_SHEET_ERRORS.values(), ids=SECOND_SHEET_ERRORS.keys())
+def test_errors_of_second_sheets_name_value_and_remedy(change: tuple[str, str], expected: str) -> None:
+    text = (CONFIG / "two_sheets.toml").read_text()
+    assert change[0] in text
+    assert expected in config_error(text.replace(*change))
+
+
 OBJECT_ERRORS = {
     'object = "bolts"': '1 "right": object = "bolts": there is no [object.bolts]; did you mean "bolt"?',
     "head_diameter_mm = 10.0": "[object.bolt]: shape.head_diameter_mm = 10: must be more than diameter_mm",
@@ -450,12 +475,21 @@ def test_errors_of_objects_name_location_value_and_remedy(change: str, expected:
     assert expected in config_error(text)
 
 
-def test_the_file_of_a_mesh_is_relative_to_the_deployment(tmp_path: Path) -> None:
+def test_the_mesh_of_an_object_is_read_beside_the_deployment_and_travels_with_it(tmp_path: Path) -> None:
     mesh = '[object.mug]\nshape = { kind = "mesh", file = "mug.stl" }\n\n[[hand]]'
     (tmp_path / "hand.toml").write_text(SMALL.replace("[[hand]]", mesh, 1))
-    shape = config.load(tmp_path / "hand.toml").objects["mug"].shape
+    stl = b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
+    for content, error in ((None, "No such file"), (b"solid mug", "no STL file")):
+        if content is not None:
+            (tmp_path / "mug.stl").write_bytes(content)
+        with pytest.raises(ConfigError, match=rf"\[object.mug\]: shape.file.*{error}"):
+            config.load(tmp_path / "hand.toml")
+    (tmp_path / "mug.stl").write_bytes(stl)
+    text = config.load(tmp_path / "hand.toml").model_dump_json(by_alias=True)
+    (tmp_path / "mug.stl").unlink()
+    shape = config.Deployment.model_validate_json(text).objects["mug"].shape
     assert shape.kind == "mesh"
-    assert shape.file == str(tmp_path / "mug.stl")
+    assert read_embedded(shape.file) == stl
 
 
 @pytest.mark.parametrize(("change", "expected"), ERRORS.values(), ids=ERRORS.keys())
@@ -636,13 +670,12 @@ def _rectangle_mm(surface: dict[str, Any]) -> tuple[float, float]:
     return middle * float(simpson(speed / spline(t)[:, 1], x=t)), middle * arc
 
 
-@pytest.mark.parametrize("output", ["stiffness", "texture"])
-def test_an_output_that_is_no_longer_estimated_is_refused_with_the_remedy(output: str) -> None:
-    raw = tomllib.loads(SMALL) | {"scene": {"outputs": ["position", output, "shape"]}}
+def test_an_output_that_is_no_longer_estimated_is_refused_with_the_remedy() -> None:
+    raw = tomllib.loads(SMALL) | {"scene": {"outputs": ["position", "texture", "shape"]}}
     with pytest.raises(ConfigError) as refused:
         config.parse(toml(raw))
     (problem,) = refused.value.problems
-    assert (problem.location, problem.value) == ("[scene]: outputs[1]", f' = "{output}"')
+    assert (problem.location, problem.value) == ("[scene]: outputs[1]", ' = "texture"')
     assert problem.remedy.startswith("is no longer estimated; delete it from the list")
 
 

@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from handtouch.config import Deployment, Shear, parse
 from handtouch.core.contact_solver import VALUE_SLICES
-from handtouch.core.shear import ShearForces, shear_parameters
+from handtouch.core.shear_pads import shear_parameters
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.core.stages.shear import ShearForces, ShearTable
 from handtouch.core.stages.solve import MOUNT_COUNT
 from handtouch.core.state import TickState
 from handtouch.field.shear import ShearPad
@@ -78,7 +79,8 @@ class ShearBench:
         self.force_status = np.full(self.pads, ForceStatus.VALID, np.uint8)
         pads = shear_parameters(self.deployment, 4, np.full(self.pads, NOISE_COUNTS))
         self.mounts = np.zeros((self.pads, MOUNT_COUNT))
-        self.forces = ShearForces(pads, self.state, self.position_status, self.force_status, self.mounts)
+        tables = [ShearTable(*shear) for shear in pads]
+        self.forces = ShearForces(tables, self.state, self.position_status, self.force_status, self.mounts)
         self.state.unverified[:] = False
         self.state.pad_state[:] = PadState.CLEAR
 

@@ -11,8 +11,9 @@ from handtouch.calibration.calibration import LawParameters
 from handtouch.config import parse
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.contact_solver import VALUE_COUNT, make_solver
-from handtouch.core.slip import SlipDetector
 from handtouch.core.stages import solve
+from handtouch.core.stages.slip import SlipDetector
+from handtouch.core.state import TickState
 from handtouch.daemon.table_cache import build_pad_model
 from tests.core.conftest import TOLERANT_DEPLOYMENT
 
@@ -29,7 +30,7 @@ def main(count: int) -> None:
     offset_std = np.full(n, 1e-7)
     solver = make_solver(model, currents, offset_std, np.ones(n, np.bool_), values)
     summed_a, times = np.zeros(n), np.zeros(n, dtype=np.int64)
-    slip = SlipDetector(5e-3, values, summed_a, times, np.ones(n, dtype=np.uint32))
+    slip = SlipDetector(5e-3, values, summed_a, times, np.ones(n, dtype=np.uint32), TickState.empty(n))
     slip.set_requested(np.ones(n, dtype=np.bool_))
     at, digest = rng.uniform(0, 1, (n, 2)), hashlib.sha256()
     for number in range(-(-count // n)):

@@ -7,9 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from handtouch.config import Touch
 from handtouch.core.contacts import ContactChanges, ContactDetector, DetectionSettings
+from handtouch.core.memory import rows_by_name
 from handtouch.core.pipeline import detect_contacts
 from handtouch.core.slab import Cycle, Slab
+from handtouch.core.stages.rows import TOUCH_ROW
 from handtouch.core.state import TickState
 
 BEGIN, END = 20.0, 10.0
@@ -18,12 +21,15 @@ BEGIN, END = 20.0, 10.0
 class Detector:
     """Contacts of one pad with a baseline of 0 and 1 A per count; debounces of so many cycles' samples."""
 
-    def __init__(self, begin: int = 2, end: int = 3, *, period_ns: int = 10) -> None:
+    def __init__(self, begin: int = 2, end: int = 3, *, period_ns: int = 10, delay_ns: int = 0) -> None:
         one, self._state, self._slab = np.ones(1), TickState.empty(1), Slab(1)
         self._state.max_sample_period_ns[:] = period_ns
         self._cycle, self._up, self._period_ns = Cycle(period_ns, 0.6), np.zeros(1, np.uint8), period_ns
-        counts = (np.array([number]) for number in (10 * (begin - 1), 10 * (end - 1), 10))
-        settings = DetectionSettings(np.ones((1, 4)), one, one, BEGIN * one, END * one, *counts)
+        touch = Touch(begin_ms=1e-5 * (begin - 1), end_ms=1e-5 * (end - 1), max_gap_periods=10)
+        settings = DetectionSettings(
+            *(np.ones((1, 4)), one, one, BEGIN * one, END * one, rows_by_name(TOUCH_ROW, [touch])),
+            np.array([delay_ns]),
+        )
         self.contacts = ContactDetector(settings, np.zeros((1, 4)), self._state)
 
     def step(self, level: float, sampled: bool = True, trusted: bool = True) -> ContactChanges:
@@ -42,6 +48,13 @@ def test_a_contact_begins_after_the_debounce_with_the_time_of_its_first_sample()
     began = [len(detector.step(30).began) for _ in range(4)]
     assert began == [0, 0, 1, 0]
     assert detector.contacts.begin_ns[0] == 10
+
+
+def test_a_sample_of_a_node_that_samples_by_itself_is_dated_by_its_delay_before_its_sync() -> None:
+    detector = Detector(begin=3, delay_ns=4)
+    began = [len(detector.step(30).began) for _ in range(4)]
+    assert began == [0, 0, 1, 0]
+    assert detector.contacts.begin_ns[0] == 10 - 4
 
 
 @pytest.mark.parametrize(("period_ns", "samples"), [(1, 11), (2, 6), (9, 2), (11, 2), (40, 2)])

@@ -24,6 +24,7 @@ from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.outline_surface import OutlineSurface
 from handtouch.hand import pad_network, pad_surface
 from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
+from tests.exact_pads import electrodes_of
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def solved(model: PadModel, fractions: NDArray[np.float64], total_a: float) -> N
 def test_contacts_are_located_without_a_dead_electrode() -> None:
     deployment = parse(arcs_text(SIX_ARCS))
     model = build_pad_model(deployment)
-    network, sheet, whole = model.networks[1], deployment.sheets["s"], model.calibrations[1]
+    network, sheet, whole = electrodes_of(model)[1], deployment.sheets["s"], model.calibrations[1]
     at = np.array([0.35, 0.62]) * (network.a, network.b)
     floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
     fractions = floating.fractions(*at)
@@ -181,7 +182,7 @@ def test_raw_counts_have_as_many_columns_as_the_pad_with_most_electrodes(
 
 def test_a_loaded_state_continues_without_its_dead_electrode() -> None:
     deployment = parse(arcs_text(SIX_ARCS))
-    network = build_pad_model(deployment).networks[1]
+    network = electrodes_of(build_pad_model(deployment))[1]
     floating = network.with_series_ohm([math.inf if k == 2 else 0.0 for k in range(6)])
     counts = np.rint(8000 * floating.fractions(0.4 * network.a, 0.6 * network.b)).astype("<i2")
 

@@ -17,7 +17,8 @@ from handtouch.simulate.contact_patch import PROFILES, discs
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.solved_contact import PatchNodes
 from handtouch.simulate.virtual_hand import VirtualHand
-from handtouch.simulate.worlds import WORLDS
+from handtouch.simulate.virtual_pad import VirtualPad
+from handtouch.simulate.worlds import WORLDS, Family
 from tests.deployments import deployment_text, pad_text
 
 FloatArray = NDArray[np.float64]
@@ -37,15 +38,15 @@ def virtual_hand(deployment: config.Deployment, *touches: dict[str, Any]) -> Vir
     return VirtualHand(deployment, Scenario.model_validate({"touch": given}), WORLDS["ideal"].draw(1))
 
 
-def solve(model: PadModel, currents: FloatArray) -> dict[str, FloatArray]:
-    """Return the values of contacts with these currents (n, 4), each by itself."""
-    every, rows = np.zeros((1, 4)), []
-    values = np.full((1, VALUE_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(1), np.ones(1, np.bool_), values)
+def solve(model: PadModel, currents: FloatArray, pad: int = 0) -> dict[str, FloatArray]:
+    """Return the values of contacts with these currents (n, c) on a pad, each by itself."""
+    every, rows = np.zeros((model.size, model.channels)), []
+    values = np.full((model.size, VALUE_COUNT), np.nan)
+    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
     for own in currents:
-        every[0], values[0] = own, np.nan
-        solver.solve_contacts(np.zeros(1, np.intp).data)
-        rows.append(values[0].copy())
+        every[pad], values[pad] = own, np.nan
+        solver.solve_contacts(np.full(1, pad, np.intp).data)
+        rows.append(values[pad].copy())
     return {name: np.array(rows)[:, where] for name, where in VALUE_SLICES.items()}
 
 
@@ -122,3 +123,75 @@ def test_two_patches_at_the_sheets_limit_give_a_bound_below_their_force() -> Non
     found = solve(model, hand.counts(0, np.array([5.0])) * model.ampere_per_count[0])
     assert found["force_status"][0, 0] == ForceEstimateStatus.LOWER_BOUND
     assert 0 < found["force_n"][0, 0] < total_n
+
+
+def ellipses(
+    deployment: config.Deployment, pad: int, places: FloatArray, angles: FloatArray, ratio: float
+) -> tuple[VirtualPad, dict[str, FloatArray]]:
+    """Return the pad, and the values of evenly pressed ellipses at places (2, n) of it."""
+    link = deployment.pads[pad].pad.link
+    touch = {"link": link, "from_s": 0.0, "duration_s": 1.0, "path": ((0.5, 0.5),), "force_n": (1.0,)}
+    scenario = Scenario.model_validate({"touch": [touch]})
+    drawn = WORLDS["ideal"].draw(Family.TUNING.seed(0))
+    deployment = drawn.describe(deployment)
+    hand = VirtualHand(deployment, scenario, drawn)
+    patch = discs(np.full(len(angles), 2.5e-3))
+    patch[1], patch[2] = ratio, angles
+    currents = hand.solve_contacts(np.full(len(angles), pad, np.intp), places, patch, np.ones(len(angles)))
+    return hand.virtual_pads[pad], solve(build_pad_model(deployment), currents, pad)
+
+
+def line_m(ratio: float) -> float:
+    """Return the length of the line with the moments of such an ellipse."""
+    return 2.5e-3 * float(np.sqrt(3 * (ratio - 1 / ratio)))
+
+
+@pytest.mark.parametrize("ratio", [1.0, 4.0])
+def test_six_electrodes_show_length_and_direction_of_a_contact(ratio: float) -> None:
+    angles = np.linspace(-1.4, 1.4, 8)
+    places = np.stack([np.linspace(0.35, 0.65, 8), np.linspace(0.6, 0.4, 8)])
+    six = config.load(config.shipped.path("electrodes.toml"))
+    pad = [len(entry.pad.electrode_names) for entry in six.pads].index(6)
+    touched, found = ellipses(six, pad, places, angles, ratio)
+    length_m, least_m, most_m = (found[name][:, 0] for name in ("length_m", "min_length_m", "max_length_m"))
+    true_m = line_m(ratio)
+    assert np.all((least_m <= true_m) & (true_m <= most_m))
+    if ratio == 1.0:
+        assert np.isnan(found["length_axis"]).all()
+        return
+    np.testing.assert_allclose(length_m, true_m, rtol=0.1)
+    along = [long_axis(touched, places[:, k], angles[k]) for k in range(len(angles))]
+    assert np.all(np.abs(np.sum(found["length_axis"] * along, axis=1)) > np.cos(0.1))
+
+
+def long_axis(pad: VirtualPad, place: FloatArray, angle: float) -> FloatArray:
+    """Return the unit vector (3,) in its link's frame along a direction on a pad [rad]."""
+    shape, (x, y) = pad.shape, place.tolist()
+    step_m = 1e-5 * np.array([np.cos(angle), np.sin(angle)])
+    dx, dy = np.linalg.solve(shape.metres_per_fraction(x, y), step_m).tolist()
+    to_m = shape.point((x + dx) * shape.length_m, (y + dy) * shape.arc)
+    from_m = shape.point(x * shape.length_m, y * shape.arc)
+    return np.asarray(pad.rotation @ (to_m - from_m)) / np.linalg.norm(to_m - from_m)
+
+
+def test_four_electrodes_show_the_shortest_line_and_no_upper_end() -> None:
+    ratio, angles = 3.0, np.linspace(-1.5, 1.5, 13)
+    places = np.full((2, 13), 0.5)
+    touched, found = ellipses(deployed(), 0, places, angles, ratio)
+    length_m = found["length_m"][:, 0]
+    # in the middle of a rectangle they show the difference along x and y
+    expected_m = line_m(ratio) * np.sqrt(np.abs(np.cos(2 * angles)))
+    np.testing.assert_allclose(length_m, expected_m, atol=4e-4)
+    assert np.isnan(found["max_length_m"]).all()
+    assert (found["min_length_m"][:, 0] <= line_m(ratio)).all()
+    sure = np.abs(np.cos(2 * angles)) > 0.3
+    along_x = np.abs(found["length_axis"][sure] @ long_axis(touched, places[:, 0], 0.0)) > 0.9
+    np.testing.assert_array_equal(along_x, np.cos(2 * angles[sure]) > 0)
+
+
+def test_three_electrodes_show_no_length() -> None:
+    three = config.load(config.shipped.path("electrodes.toml"))
+    pad = [len(entry.pad.electrode_names) for entry in three.pads].index(3)
+    _, found = ellipses(three, pad, np.full((2, 2), 0.5), np.zeros(2), 3.0)
+    assert np.isfinite(found["pad_m"]).all()
+    assert np.isnan(found["length_m"]).all()

@@ -24,7 +24,7 @@ FloatArray = np.ndarray
 
 def played(levels: FloatArray, touched: FloatArray | None = None, block: int = 20) -> LevelScatter:
     """Return the scatter of a pad that begins contacts after two samples, by blocks of so many ticks."""
-    scatter = LevelScatter([PERIOD_NS])
+    scatter = LevelScatter([1e-6 * PERIOD_NS])
     held = np.zeros(len(levels), bool) if touched is None else touched
     times = (1 + np.arange(len(levels))) * PERIOD_NS
     for first, end in pairwise(range(0, len(levels) + 1, block)):
@@ -39,7 +39,7 @@ def test_as_many_samples_begin_a_contact_as_the_least_threshold_assumes(begin: i
     samples = 1
     while not len(detector.step(BEGIN + 1).began):
         samples += 1
-    assert samples == begin_samples(10 * (begin - 1), period_ns)
+    assert samples == begin_samples(1e-5 * (begin - 1), period_ns)
 
 
 @pytest.mark.parametrize("samples", [1, 2, 5])

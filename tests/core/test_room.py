@@ -132,6 +132,46 @@ def test_a_pad_that_warms_up_by_ten_kelvin_in_two_minutes_is_clear(bench: Any, s
     assert (states == PadState.CLEAR).all()
 
 
+@pytest.mark.parametrize("drift", [(-40.0, 30.0, -25.0, 20.0), (-8.0, -60.0, -8.0, -30.0)])
+def test_zeros_that_moved_while_a_pad_was_touched_are_learned_when_it_is_released(
+    bench: Any, drift: tuple[float, ...]
+) -> None:
+    room, firm = Room(bench, 50.0), touch(bench, 40.0)
+    room.run(2.0, steady(0.0))
+    moved = np.zeros((bench.model.size, 4))
+    moved[0] = drift
+    held = room.run(60.0, lambda t_s: firm + moved * t_s / 60.0)
+    released = room.run(3.0, lambda _: moved)
+    assert (held[5:, 0] == PadState.TOUCHED).all()
+    assert (released[5:, 0] == PadState.CLEAR).all()
+    assert room.contacts == 1
+    again = room.run(0.5, lambda _: moved + touch(bench, 1.5))
+    assert (again[5:, 0] == PadState.TOUCHED).all()
+    assert room.pipeline.tick.baseline.expected_counts[0] == pytest.approx(drift, abs=2.0)
+
+
+def test_what_drift_left_of_a_contact_ends_when_it_lies_still(bench: Any) -> None:
+    room, firm, left = Room(bench, 50.0), touch(bench, 40.0), touch(bench, 0.8)
+    room.run(2.0, steady(0.0))
+    room.run(60.0, lambda t_s: firm + left * t_s / 60.0)
+    states = room.run(15.0, lambda _: left)
+    assert (states[-50:, 0] == PadState.CLEAR).all()
+    assert room.contacts == 1
+
+
+@pytest.mark.parametrize(
+    ("firmer", "held_s", "trembles"), [(40.0, 60.0, 0.2), (40.0, 5.0, 0.0), (5.0, 60.0, 0.0)]
+)
+def test_a_light_contact_lasts_that_moves_came_soon_or_was_never_much_firmer(
+    bench: Any, firmer: float, held_s: float, trembles: float
+) -> None:
+    room, light = Room(bench, 50.0), touch(bench, 1.2)
+    room.run(2.0, steady(0.0))
+    room.run(held_s, lambda _: firmer * light)
+    states = room.run(15.0, lambda t_s: light * (1 + trembles * np.sin(2 * np.pi * 3 * t_s)))
+    assert (states[:, 0] == PadState.TOUCHED).all()
+
+
 def test_a_step_below_the_baseline_is_a_fault_not_drift(bench: Any) -> None:
     room = Room(bench)
     room.run(2.0, steady(0.0))

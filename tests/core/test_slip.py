@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.core.slip import GripModel, SlipDetector
-from handtouch.core.stages.slip import MOTION_CLASSES
+from handtouch.core.stages.slip import INFORMATION, MOTION_CLASSES, GripModel, SlipDetector
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -44,7 +44,10 @@ class Contacts:
         self.values = np.full((pads, VALUE_COUNT), np.nan)
         self.current_a, self.times = np.zeros(pads), np.zeros(pads, dtype=np.int64)
         self.ids = np.arange(1, pads + 1, dtype=np.uint32)
-        self.slip = SlipDetector(dt_s, self.values, self.current_a, self.times, self.ids, false_alarm_s, grip)
+        held = TickState.empty(pads)
+        self.slip = SlipDetector(
+            dt_s, self.values, self.current_a, self.times, self.ids, held, false_alarm_s, grip
+        )
         self.slip.set_requested(np.ones(pads, dtype=np.bool_))
 
     def step(
@@ -57,7 +60,7 @@ class Contacts:
     ) -> BoolArray:
         """Process the k-th sample of all pads or some, at positions (n, 2); return which slips began (n,)."""
         rows = self.pads if pads is None else pads
-        before = self.slip.column("slipping") != 0
+        before = self.slip.contacts().slipping != 0
         self.values[:, VALUE_SLICES["pad_m"]] = position_m
         self.values[:, VALUE_SLICES["pad_noise_m2"]] = noise_m**2 * np.array([1.0, 0.0, 1.0])
         self.values[:, VALUE_SLICES["covariance_m2"]] = noise_m**2 * np.eye(3).ravel()
@@ -65,7 +68,7 @@ class Contacts:
         self.current_a[:] = 1e-3 * np.asarray(force_n)
         self.times[rows] = 10**9 + round(k * self._dt_s * 1e9)
         self.slip.detect_slips(rows)
-        return np.asarray((self.slip.column("slipping") != 0) & ~before)
+        return np.asarray((self.slip.contacts().slipping != 0) & ~before)
 
 
 def alarms(
@@ -176,7 +179,8 @@ def test_onset_and_speed_match_the_slip() -> None:
     contacts = Contacts(1)
     for k in range(312):
         contacts.step(k, place[k])
-    (age_s,), (velocity,) = (contacts.slip.column(name) for name in ("onset_age_s", "slip_velocity_m_per_s"))
+    (contact,) = contacts.slip.contacts()
+    age_s, velocity = contact.onset_age_s, contact.slip_velocity_m_per_s
     assert age_s == pytest.approx(11 * DT_S, abs=3 * DT_S)
     assert velocity == pytest.approx([0, -20e-3], abs=3e-3)
 
@@ -211,7 +215,8 @@ def test_information_of_a_slip_grows_with_its_age() -> None:
     contacts = Contacts(1)
     for k in range(61):
         contacts.step(k, np.zeros((1, 2)))
-    (ages,), (information,) = (contacts.slip.column(name) for name in ("onset_ages_s", "information_x"))
+    (contact,) = contacts.slip.contacts()
+    ages, information = contact.onset_ages_s, contact.ramps[0, INFORMATION]
     begun = ages > 0
     assert ages[begun].max() == pytest.approx(59 * DT_S, abs=5 * DT_S)
     assert (np.diff(information[begun]) > 0).all()
@@ -252,7 +257,7 @@ def test_unloading_until_the_force_vanishes_is_lift_off() -> None:
     labels = []
     for k in range(200, 216):
         contacts.step(k, np.zeros((1, 2)), force_n=FORCE_N * (1 - (k - 199) / 20))
-        labels.append(int(contacts.slip.column("label")[0]))
+        labels.append(int(contacts.slip.contacts().label[0]))
     assert MOTION_CLASSES[labels[-1]] == "lift-off"
     assert MOTION_CLASSES[labels[0]] == "sticking"
 
@@ -266,7 +271,7 @@ def test_evidence_near_the_threshold_does_not_chatter() -> None:
     before, falls = np.full(10, -np.inf), []
     for k in range(steps):
         contacts.step(k, place[k] + NOISE_M * rng.standard_normal((10, 2)))
-        odds = contacts.slip.column("log_odds").copy()
+        odds = contacts.slip.contacts().log_odds.copy()
         known = np.isfinite(before) & np.isfinite(odds)
         falls += (before[known] - odds[known]).tolist()
         before = odds

@@ -32,8 +32,9 @@ class Contacts:
     ) -> None:
         self._currents, self._values = np.zeros((3, 4)), np.full((3, VALUE_COUNT), np.nan)
         requested = np.full(3, force_requested)
+        measured = {} if noise_squared is None else {"noise_squared": noise_squared}
         self._solver = make_solver(
-            model, self._currents, np.zeros(3), requested, self._values, noise_squared=noise_squared
+            model, self._currents, np.zeros(3), requested, self._values, measured=measured
         )
 
     def solve(self, currents: FloatArray) -> None:
@@ -206,7 +207,7 @@ def test_a_force_at_the_end_of_the_range_is_a_value_or_a_lower_bound(bench: Any)
         same = bound == (status == ForceEstimateStatus.LOWER_BOUND)
         assert np.isinf(contacts.force_std_n[bound]).all()
         # where a hundredth of the factor is half of the force
-        assert (np.abs(np.log(contacts.force_n / force_n)) < 1.0)[same & bound].all()
+        assert (np.abs(np.log(contacts.force_n / force_n)) < 1.2)[same & bound].all()
         clear = ~bound & (std_n < 0.3 * force_n)
         assert (np.abs(contacts.force_n - force_n) < contacts.force_std_n)[clear].all()
     assert statuses == {ForceEstimateStatus.VALID, ForceEstimateStatus.LOWER_BOUND}
@@ -261,6 +262,19 @@ def test_contacts_on_a_pad_whose_electrodes_touch_are_located() -> None:
     np.testing.assert_allclose(values[0, VALUE_SLICES["xy"]], at, atol=1e-6)
     covariance = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)
     assert 0 < np.trace(covariance) < 1e-6
+
+
+@pytest.mark.parametrize("place", [(0.01, 0.01), (0.99, 0.01)])
+def test_of_two_maxima_beside_a_bare_corner_the_more_likely_one_is_found(place: tuple[float, float]) -> None:
+    pad = pad_text("link", 1, extra="series_ohm = [336.0, 336.0, 336.0, 336.0]", gap_mm=0.6)
+    model = build_pad_model(parse(deployment_text(pad, exact_parts=True, noise_counts=1e-3)))
+    (network,) = model.networks
+    at = np.multiply(place, (network.a, network.b))
+    values = np.full((1, VALUE_COUNT), np.nan)
+    currents = 1e-3 * network.fractions(*at)[None]
+    make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(np.arange(1).data)
+    variance = np.trace(values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3))
+    assert np.sum((values[0, VALUE_SLICES["xy"]] - at) ** 2) < variance < 1e-6
 
 
 @pytest.mark.parametrize("ratio", [0.5, 3.0])

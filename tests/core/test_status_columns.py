@@ -140,3 +140,25 @@ def test_the_force_is_unreliable_from_begin_to_end_of_a_contact_older_than_the_b
         statuses += [m.force_status for m in driver.sent.messages if isinstance(m, wire.Contact)]
     assert len(statuses) > 49
     assert set(statuses) == {"unreliable"}
+
+
+def test_on_a_pad_whose_contacts_never_fit_one_that_does_is_unreliable_until_others_fit(bench: Any) -> None:
+    """As with a dead channel, whose contacts near a corner look like those of another place."""
+    driver = _Driver(bench)
+    right = driver.touched[PLANE]
+    odd = np.frombuffer(right, "<i2").copy()
+    odd[1] = 0
+
+    def press(sample: bytes) -> wire.Contact:
+        driver.touched[PLANE] = sample
+        for _ in range(30):
+            driver.run_cycle()
+        return [driver.run_cycle(PLANE)[1] for _ in range(6)][-1]["plane"]
+
+    assert press(right).position_status == "valid"
+    for _ in range(12):
+        assert press(odd.tobytes()).position_status == "unreliable"
+    fits = press(right)
+    assert (fits.position_status, fits.force_status) == ("unreliable", "unreliable")
+    statuses = [press(right).position_status for _ in range(8)]
+    assert statuses[-1] == "valid"

@@ -61,7 +61,7 @@ def test_a_contact_has_its_position_in_the_frame_of_its_link(driver: Driver) -> 
     np.testing.assert_allclose(columns.position_m[PLANE], [0.01 + 0.0024, 0.006, 0.005], atol=2e-5)
     np.testing.assert_allclose(columns.normal[PLANE], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(columns.pad_m[PLANE], [0.021, 0.0096], atol=2e-5)
-    assert columns.force_n[PLANE] > driver.bench.model.begin_threshold_n[PLANE]
+    assert columns.force_n[PLANE] > driver.bench.model.touch.begin_threshold_n[PLANE]
     assert columns.force_std_n[PLANE] > 0
     assert abs(columns.residual[PLANE]) < 5 * columns.residual_std[PLANE]
 

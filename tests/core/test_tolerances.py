@@ -19,7 +19,7 @@ from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import electrode_network, part_stds
 from tests.core.conftest import DEPLOYMENT, TOLERANT_DEPLOYMENT
 from tests.deployments import deployment_text, pad_text
-from tests.exact_pads import ExactPads
+from tests.exact_pads import ExactPads, electrodes_of
 
 FloatArray = NDArray[np.float64]
 RESISTED = 2
@@ -84,10 +84,12 @@ def test_tables_of_tolerances_agree_with_networks_of_other_parts(
     exact = change(*(other_network(deployment, row, 0.0, step) for step in (1e-3, -1e-3))) / 2e-3
     assert np.abs(np.moveaxis(values[..., 8:12], -1, 0) - exact).max() < 1e-4 * np.abs(exact).max()
     if row == RESISTED:
-        fractions = model.networks[row].fractions(x * model.networks[row].a, y * model.networks[row].b)
+        fractions = electrodes_of(model)[row].fractions(
+            x * electrodes_of(model)[row].a, y * electrodes_of(model)[row].b
+        )
         for number, one in enumerate(np.eye(4)):
             exact = change(*(other_network(deployment, row, log_series=step * one) for step in (1e-3, -1e-3)))
-            per_ohm = table.series_vectors[number] * model.networks[row].series_ohm[number]
+            per_ohm = table.series_vectors[number] * electrodes_of(model)[row].series_ohm[number]
             tabulated = per_ohm[:, None, None] * fractions[number]
             assert np.abs(tabulated - exact / 2e-3).max() < 1e-4 * np.abs(exact / 2e-3).max()
 
@@ -100,9 +102,9 @@ def test_learned_parts_replace_the_stated_tolerances(deployment: Deployment) -> 
     offsets = np.zeros(len(stds))
     offsets[:8], offsets[8] = 0.5 * rng.normal(0, 1, 8), 1.5
     gaps_m, aspect = 1e-3 * stds[0] * offsets[:8].reshape(4, 2), stds[8] * offsets[8]
-    true = [other_network(deployment, 0, gaps_m, aspect), *learned.networks[1:]]
+    true = [other_network(deployment, 0, gaps_m, aspect), *electrodes_of(learned)[1:]]
     at = np.full((3, 2), [0.25, 0.4])
-    x, y = (at * sides(learned.networks)).T
+    x, y = (at * sides(electrodes_of(learned))).T
     exact = ExactPads(deployment, learned).position_m(np.arange(3), x, y)[0]
     stated_error = np.linalg.norm(solve(learned, at, true)[1][0] - exact)
     variance, covariance = {}, matrix(1e-12 * np.eye(4 + len(stds)))
@@ -147,14 +149,14 @@ def test_a_position_next_to_a_corner_has_a_bounded_covariance(
         networks = [drawn_network(deployment, row, rng) for row in range(3)]
         covariance, position, _ = solve(model, rng.uniform(0.02, 0.08, (3, 2)), networks, 1.0, rng)
         assert np.isfinite(position).all()
-        anywhere = (sides(model.networks) ** 2).sum(axis=1) / 12
+        anywhere = (sides(electrodes_of(model)) ** 2).sum(axis=1) / 12
         assert (np.trace(covariance, axis1=1, axis2=2) < anywhere).all()
 
 
 def test_two_contacts_along_a_side_are_no_point_and_their_covariance_includes_their_distance(
     model: PadModel,
 ) -> None:
-    networks, apart = model.networks, 0.3
+    networks, apart = electrodes_of(model), 0.3
     side_x, side_y = sides(networks).T
     pair = [
         net.fractions((0.5 - apart / 2) * a, 0.5 * b) + net.fractions((0.5 + apart / 2) * a, 0.5 * b)
@@ -173,9 +175,8 @@ def shares_in_their_regions(model: PadModel, network: ElectrodeNetwork) -> tuple
     and the mean misfits of these ten."""
     rng, values = np.random.default_rng(7), np.full((3, VALUE_COUNT), np.nan)
     currents, misfits = np.zeros((3, 4)), np.zeros((3, 3))
-    solver = make_solver(
-        *(model, currents, np.zeros(3), np.ones(3, np.bool_), values), misfits=misfits
-    )  # fmt: skip
+    requested, measured = np.ones(3, np.bool_), {"misfits": misfits}
+    solver = make_solver(model, currents, np.zeros(3), requested, values, measured=measured)
     (a, b), inside, means = sides([network])[0], [], []
     for _ in range(30):
         misfits[:] = 0.0
@@ -197,11 +198,11 @@ def shares_in_their_regions(model: PadModel, network: ElectrodeNetwork) -> tuple
 def test_misfits_of_earlier_contacts_widen_the_regions_of_a_pad_that_is_not_as_stated() -> None:
     stated = parse(deployment_text(pad_text("plane", 1), *(pad_text(f"other{k}", k) for k in (2, 3))))
     model = build_pad_model(stated)
-    with_leads = model.networks[0].with_series_ohm([10.0, 0.0, 5.0, 20.0])
+    with_leads = electrodes_of(model)[0].with_series_ohm([10.0, 0.0, 5.0, 20.0])
     alone, after = shares_in_their_regions(model, with_leads)[0]
     assert alone < 0.65
     assert after > 0.75
-    means = shares_in_their_regions(model, model.networks[0])[1]
+    means = shares_in_their_regions(model, electrodes_of(model)[0])[1]
     assert means.max() < 0.5
 
 
@@ -221,7 +222,7 @@ def solve(
     gains: FloatArray | float = 1.0, rng: np.random.Generator | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return covariances (3, 3, 3), positions and normals (3, 3) of contacts at xy (3, 2), in sides."""
-    used = networks or model.networks
+    used = networks or electrodes_of(model)
     fractions = np.array([net.fractions(*at) for net, at in zip(used, xy * sides(used), strict=True)])
     currents, values = gains * 2e-3 * fractions, np.full((3, VALUE_COUNT), np.nan)
     if rng:
@@ -240,7 +241,7 @@ def squared_distances(deployment: Deployment, model: PadModel, rng: np.random.Ge
     for _ in range(5):
         xy = rng.uniform(0.02, 0.98, (3, 2))
         covariance, position, normal = solve(model, xy, networks, gains, rng)
-        x, y = (xy * sides(model.networks)).T
+        x, y = (xy * sides(electrodes_of(model))).T
         true_m = ExactPads(deployment, model).position_m(np.arange(3), x, y)
         for row in range(3):
             tangents = np.linalg.svd(normal[row][None])[2][1:]
@@ -271,7 +272,7 @@ def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
             if not np.isfinite(values[0, VALUE_SLICES["position_m"]]).all():
                 continue
             along = np.linalg.svd(values[:, VALUE_SLICES["normal"]])[2][1:]
-            at = np.array([x * model.networks[0].a]), np.array([y * model.networks[0].b])
+            at = np.array([x * electrodes_of(model)[0].a]), np.array([y * electrodes_of(model)[0].b])
             true = exact.position_m(np.zeros(1, np.intp), *at)[0]
             error = along @ (values[0, VALUE_SLICES["position_m"]] - true)
             covariance = along @ values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3) @ along.T

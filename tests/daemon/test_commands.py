@@ -112,7 +112,7 @@ def served(bench: Any, endpoints: dict[str, str]) -> Iterator[Bench]:
 def test_a_daemon_whose_every_tick_is_late_answers_and_notifies_the_watchdog(
     served: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(served.daemon.gravity, "update_directions", lambda _: time.sleep(4e-9 * PERIOD_NS))
+    monkeypatch.setattr(served.daemon.gravity, "update_felt", lambda _: time.sleep(4e-9 * PERIOD_NS))
     stop, notified = threading.Event(), list[int]()
     thread = threading.Thread(target=served.daemon.run, args=(stop, notified.append))
     thread.start()

@@ -28,11 +28,11 @@ PADS = [("left", "tip"), ("right", "tip"), ("right", "palm")]
 
 
 def test_gravity_is_normalised_and_the_newest_value_holds(inputs: InputReceiver) -> None:
-    assert inputs.gravity_direction("right") is None
+    assert inputs.base_pose("right", "gravity") is None
     for number, gravity in enumerate([[0.0, 0.0, -9.81], None, [1e300, 0.0, 0.0], None]):
         payload = {"v": 1, "t_ns": NOW + number, "names": ["a"], "position_rad": [0.1], "gravity": gravity}
         inputs.process_message([b"joints/right", msgpack.packb(payload)], NOW + number)
-        down = inputs.gravity_direction("right")
+        down = inputs.base_pose("right", "gravity")
         assert down is not None
         assert down.tolist() == ([0.0, 0.0, -1.0] if number < 2 else [1.0, 0.0, 0.0])
 

@@ -32,7 +32,7 @@ VALUES: dict[str, object] = {
     "excitation_object": "0x2100:0:u8",
     "electrodes": ("xa", "x0", "y0", "yb"),
 }
-NOT_WALKED = {"node", "sheet", "shear", "electrode_arcs_mm", "switch_states"}
+NOT_WALKED = {"node", "second_sheet", "shear", "electrode_arcs_mm", "switch_states"}
 """keys of a pad that need another table, or other electrodes"""
 
 

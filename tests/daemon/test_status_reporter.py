@@ -18,7 +18,7 @@ from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent, SerialChanged
 from handtouch.config import Behaviour
 from handtouch.core.pipeline import Pipeline
-from handtouch.daemon.status_reporter import StatusReporter
+from handtouch.daemon.status_reporter import Buses, Statistics, StatusReporter, Workers
 from handtouch.wire.health import Emergency
 from tests.sheet.test_bank import Pads
 
@@ -41,15 +41,15 @@ class Rig:
             has_subscriber=lambda topic: topic == "service", send=self.services.append, session=1,
             congestion_episodes={}, subscriptions=(),
         )  # fmt: skip
-        parts: tuple[Any, ...] = (pipeline, master, {"can0": port}, self.sync, publisher)
+        ports: Any = {"can0": port}
+        parts: tuple[Any, ...] = (Buses(master, ports, self.sync), publisher)  # type: ignore[arg-type]
         self.reporter = StatusReporter(
             bench.deployment,
+            pipeline,
             *parts,
             started_ns=0,
-            wall_offset_ns=lambda: 0,
-            process_statistics=dict,
-            refusals=dict,
-            input_statistics=lambda _: {},
+            statistics=Statistics(lambda: 0, process=dict, refusals=dict, inputs=lambda _: {}),
+            workers=Workers(),
         )
         self.now_ns = SECOND_NS
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.calibration.auto_calibration import CalibrationState
+from handtouch.calibration.calibration import CalibrationState
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
 from handtouch.config import Behaviour

@@ -39,7 +39,7 @@ def test_a_pad_that_reads_a_load_since_the_start_is_tared(bench: Any) -> None:
     least_n = result["least_begin_threshold_n"]
     counts = room.pipeline.model.centre_current(0, least_n) / room.pipeline.model.mean_ampere_per_count[0]
     assert 6.0 < counts < 12.0  # 5.55 deviations of the mean of two sums: noise of a count and rounding
-    assert result["begin_threshold_n"] == room.pipeline.model.begin_threshold_n[0]
+    assert result["begin_threshold_n"] == room.pipeline.model.touch.begin_threshold_n[0]
     states = room.run(1.0, lambda _: zeros)
     assert (states[10:, 0] == PadState.CLEAR).all()
     light = touch(bench, 2.0)

@@ -242,13 +242,15 @@ def test_design_command_writes_tables_of_six_electrodes_that_the_daemon_accepts(
 def test_design_command_writes_drawings_and_tables(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["--goal", "position", "--world", "ideal", "--force", "0.06", "--max-series-ohm", "0"]
+    arguments = ["--goal", "force", "--world", "ideal", "--force", "0.06", "--max-series-ohm", "0"]
     command = ["design", str(CONFIG / "two_finger.toml"), "--link", "thumb_tip", *arguments]
     assert main([*command, "--no-check", "--json", "-o", str(tmp_path)]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["after"] <= report["before"]
     assert {Path(file).suffix for file in report["files"]} == {".png", ".svg", ".dxf", ".toml"}
-    assert main(["check", str(tmp_path / "thumb_tip_position.toml")]) == 0
+    assert report["sheet_forces_n"] == [0.06, 0.1, 0.3]
+    assert [case["is_configured"] for case in report["sheets"]][:2] == [True, False]
+    assert main(["check", str(tmp_path / "thumb_tip_force.toml")]) == 0
     assert re.search(r"no warnings", capsys.readouterr().out)
 
 

@@ -111,7 +111,7 @@ def test_identity_mapping_and_readings_are_read_over_sdo(three: Any) -> None:
 
 
 def test_the_identity_that_is_given_outranks_the_eds(bench: Any) -> None:
-    bench.bus.add(3, vendor_id=0x77, product_code=0x88, serial=0x99).plug()
+    bench.bus.add(3, kind=(0x77, 0x88), serial=0x99).plug()
     bench.take()
     assert [bench.read(3, 0x1018, sub) for sub in (1, 2, 3, 4)] == [0x77, 0x88, 0x10000, 0x99]
 

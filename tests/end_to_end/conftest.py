@@ -21,7 +21,7 @@ import pytest
 
 from handtouch.client import Subscriber, connect, request
 from handtouch.config import shipped
-from tests.starter import Started, Starter, find_port, own_endpoints
+from tests.starter import STACKS_SIGNAL, Started, Starter, find_port, own_endpoints
 
 ROOT = Path(__file__).parents[2]
 START_S = 90.0
@@ -131,7 +131,14 @@ class Rig:
         """Exit status and output of a handtouch command."""
         assert self._starter is not None
         with (self.folder / "call.txt").open("w+") as output:
-            status = self._starter.start([*arguments], output, **environment).wait(START_S)
+            process = self._starter.start([*arguments], output, **environment)
+            try:
+                status = process.wait(START_S)
+            except subprocess.TimeoutExpired:
+                process.send_signal(STACKS_SIGNAL)
+                time.sleep(1.0)  # in which it prints them
+                output.seek(0)
+                pytest.fail(f"{arguments} hangs:\n{output.read()}")
             output.seek(0)
             return status, output.read()
 

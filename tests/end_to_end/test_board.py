@@ -2,59 +2,190 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+import tty
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import pytest
 
 from handtouch import connect, wire
-from handtouch.config import load, shipped
-from handtouch.hand import pad_network
+from handtouch.config import Deployment, load, shipped
+from handtouch.hand import pad_channels, pad_surface
+from tests.deployments import arcs_text
 from tests.starter import find_port, own_endpoints
 
 ROOT = Path(__file__).parents[2]
 CHANNEL = "239.74.163.2"
-PERIOD_MS = 20.0
+PERIOD_MS, SYNC_PERIOD_MS = 20.0, 22.0
 LONGEST_S = 90.0
-MA_PER_UNIT = 0.01
-DBC = """VERSION ""
-NS_ :
-BS_:
-BU_: HAND
-BO_ 300 TIP: 8 HAND
- SG_ x0 : 0|16@1- (1,0) [0|0] "" HAND
- SG_ xa : 16|16@1- (1,0) [0|0] "" HAND
- SG_ y0 : 32|16@1- (1,0) [0|0] "" HAND
- SG_ yb : 48|16@1- (1,0) [0|0] "" HAND
+MAX_TRIES = 10
+MA_PER_COUNT, TOTAL_MA = 0.005, 2.0
+FULL_SCALE_COUNTS = 2000  # of the sensor, 10 mA
+LATE_NS = 1_000_000 * round(3 * PERIOD_MS + 50 + SYNC_PERIOD_MS)
+"""Longest that a value may have waited, before its SYNC: in the node, and in its queue"""
+SIXTEEN_ARCS = {f"e{k}": (56.55 * k / 16 + 0.2, 56.55 * (k + 1) / 16 - 0.3) for k in range(16)}
+PRESSES = ((0.4, 0.6), (0.65, 0.45))
+"""Positions, as fractions of the pad's rectangle"""
+
+
+class Case(NamedTuple):
+    """A pad of a deployment: its link and channels, their unit in the file of the node, their sum where it is
+    pressed, and the greatest value of one."""
+
+    text: str
+    link: str
+    channels: int
+    unit: str = f"ma_per_unit = {MA_PER_COUNT}"
+    total: float = TOTAL_MA / MA_PER_COUNT
+    greatest: int = FULL_SCALE_COUNTS
+
+    def values(self, deployment: Deployment, at: tuple[float, float]) -> list[int]:
+        (pad,) = [entry.pad for entry in deployment.pads if entry.pad.link == self.link]
+        model = pad_channels(pad, deployment.sheet_of(pad), deployment.nodes[pad.node])
+        shares = model.fractions(at[0] * model.a, at[1] * model.b)
+        return [round(self.total * float(share)) for share in shares]
+
+    def position_m(self, deployment: Deployment, at: tuple[float, float]) -> Any:
+        (pad,) = [entry.pad for entry in deployment.pads if entry.pad.link == self.link]
+        surface = pad_surface(pad)
+        return surface.point(at[0] * surface.a, at[1] * surface.b)
+
+
+CASES = {
+    "four electrodes": Case(shipped.path("two_finger.toml").read_text(), "thumb_tip", 4),
+    "nine taxels": Case(
+        shipped.path("taxels.toml").read_text(), "tip", 9, "full_scale = 32767", 2000.0, 32767
+    ),
+    "sixteen electrodes": Case(arcs_text(SIXTEEN_ARCS), "disc", 16),
+}
+
+
+class Sensor(Protocol):
+    """A simulated board or hand; `counts` may be changed at any time."""
+
+    counts: list[int]
+
+    def plug(self) -> None: ...
+
+    def unplug(self) -> None: ...
+
+
+class PtyBoard:
+    """A board that prints its values on a pseudo-terminal, which has another name each time it is plugged."""
+
+    def __init__(self, folder: Path, channels: int) -> None:
+        self.counts = [0] * channels
+        self.port = folder / "ttyBoard"
+        self._file = -1
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def plug(self) -> None:
+        self._file, port = os.openpty()
+        tty.setraw(port)
+        self.port.unlink(missing_ok=True)
+        self.port.symlink_to(os.ttyname(port))
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._print, args=(port,))
+        self._thread.start()
+
+    def unplug(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            os.close(self._file)
+
+    def _print(self, port: int) -> None:
+        os.set_blocking(self._file, False)  # a board doesn't wait for whoever reads
+        while not self._stop.wait(1e-3 * PERIOD_MS):
+            line = ", ".join(map(str, self.counts)) + "\r\n"
+            try:
+                os.write(self._file, line.encode())
+            except BlockingIOError:
+                continue
+        os.close(port)
+
+
+class CanHand:
+    """A hand that sends its values as raw CAN frames, four in each."""
+
+    PROGRAM = """
+import struct, sys, threading, time, can
+channel, port, period_s, count = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
+counts = [0] * count
+def read():
+    for line in sys.stdin:
+        counts[:] = map(int, line.split())
+threading.Thread(target=read, daemon=True).start()
+bus = can.Bus(interface="udp_multicast", channel=channel, port=port)
+while True:
+    for k in range(0, count, 4):
+        data = struct.pack("<4h", *(counts[k : k + 4] + [0] * 3)[:4])
+        bus.send(can.Message(arbitration_id=300 + k, data=data, is_extended_id=False))
+    time.sleep(period_s)
 """
+
+    def __init__(self, start: Callable[..., subprocess.Popen[bytes]], port: int, channels: int) -> None:
+        self._start, self._port, self._channels = start, port, channels
+        self._process: subprocess.Popen[bytes] | None = None
+        self._counts = [0] * channels
+
+    @property
+    def counts(self) -> list[int]:
+        return self._counts
+
+    @counts.setter
+    def counts(self, counts: list[int]) -> None:
+        self._counts = counts
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.write(" ".join(map(str, counts)).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def plug(self) -> None:
+        words = ["-c", self.PROGRAM, CHANNEL, str(self._port), str(1e-3 * PERIOD_MS), str(self._channels)]
+        self._process = self._start(*words, stdin=subprocess.PIPE)
+
+    def unplug(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
 
 
 class Bench:
-    """The gripper of two_finger.toml, served by `handtouch node` on a bus of its own."""
+    """A deployment served by `handtouch node` on a bus of its own."""
 
     def __init__(self, folder: Path, endpoints: dict[str, str], prefix: list[str]) -> None:
         self.folder, self.endpoints, self._prefix = folder, endpoints, prefix
-        self.options = f"options = {{ port = {find_port()} }}"
-        self.bus = f'interface = "udp_multicast"\nchannel = "{CHANNEL}"\n{self.options}\n'
-        text = shipped.path("two_finger.toml").read_text()
-        urdf = shipped.path("two_finger.urdf")
-        settings = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in endpoints.items())
-        for old, new in (
-            ("two_finger.urdf", str(urdf)),
-            ("[daemon]\n", f"[daemon]\nsupervise = false\n{settings}"),
-            ("sync_period_ms = 10.0", f"sync_period_ms = {PERIOD_MS}"),
-            (f'channel = "{CHANNEL}"', f'channel = "{CHANNEL}"\n{self.options}'),
-        ):
-            assert old in text
-            text = text.replace(old, new)
+        self.bus = (
+            f'interface = "udp_multicast"\nchannel = "{CHANNEL}"\noptions = {{ port = {find_port()} }}\n'
+        )
         self.config = folder / "hand.toml"
-        self.config.write_text(text)
         self._running: list[subprocess.Popen[bytes]] = []
+
+    def write_hand(self, text: str, *changes: tuple[str, str]) -> Deployment:
+        settings = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in self.endpoints.items())
+        lines = [
+            line for line in text.splitlines() if not line.startswith(("interface", "channel =", "sync_p"))
+        ]
+        text = "\n".join(lines)
+        for old, new in (
+            ("[daemon]", f"[daemon]\nsupervise = false\nsync_period_ms = {SYNC_PERIOD_MS}\n{settings}"),
+            ('name = "can0"', f'name = "can0"\n{self.bus}'),
+            *changes,
+        ):
+            assert old in text, old
+            text = text.replace(old, new)
+        self.config.write_text(text)
+        return load(self.config)
 
     def write_node(self, tables: str) -> Path:
         """Write the file of a node on the hand's bus."""
@@ -68,23 +199,59 @@ class Bench:
             self._running.append(subprocess.Popen(words, **{"stdout": output, "stderr": output, **options}))
         return self._running[-1]
 
-    def contacts(self, count: int) -> list[wire.Contact]:
-        """Return the next updates with a valid position, of both fingers."""
-        found: list[wire.Contact] = []
+    def serve(self, node: Path) -> None:
+        self.start("-m", "handtouch", "node", str(node))
+        self.start("-m", "handtouch", "run", str(self.config))
+
+    def outputs(self) -> list[str]:
+        return [path.read_text() for path in sorted(self.folder.glob("*.txt"))]
+
+    def wait_for_output(self, text: str) -> None:
         end_s = time.monotonic() + LONGEST_S
-        with connect("contact/*/*", endpoint=self.endpoints["live"], key="") as messages:
-            while len(found) < count:
-                assert time.monotonic() < end_s, [path.read_text() for path in self.folder.glob("*.txt")]
-                message = messages.recv(1.0)
-                if isinstance(message, wire.Contact) and message.position_status == "valid":
-                    found.append(message)
-        return found
+        while not any(text in output for output in self.outputs()):
+            assert time.monotonic() < end_s, self.outputs()
+            time.sleep(0.02)
 
     def end(self) -> None:
         for process in self._running:
             process.terminate()
         for process in self._running:
             process.wait(LONGEST_S)
+
+
+class Client:
+    """Messages of one link."""
+
+    def __init__(self, bench: Bench, link: str) -> None:
+        self._bench = bench
+        self._messages = connect(
+            f"contact/*/{link}", f"health/*/{link}", endpoint=bench.endpoints["live"], key=""
+        )
+
+    def __enter__(self) -> Client:
+        self._messages.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._messages.__exit__(*error)
+
+    def wait_for(self, condition: Callable[[Any], bool]) -> list[Any]:
+        """Return the messages up to the first that fulfils a condition, that included."""
+        end_s, found = time.monotonic() + LONGEST_S, list[Any]()
+        while not found or not condition(found[-1]):
+            assert time.monotonic() < end_s, (found[-3:], self._bench.outputs())
+            message = self._messages.recv(1.0)
+            if message is not None:
+                found.append(message)
+        return found
+
+    def wait_for_state(self, state: str) -> list[Any]:
+        return self.wait_for(lambda message: isinstance(message, wire.Health) and message.state == state)
+
+    def wait_for_event(self, event: str) -> wire.Contact:
+        found = self.wait_for(lambda message: isinstance(message, wire.Contact) and message.event == event)
+        contact: wire.Contact = found[-1]
+        return contact
 
 
 @pytest.fixture
@@ -95,54 +262,108 @@ def bench(tmp_path: Path, network: list[str]) -> Iterator[Bench]:
         made.end()
 
 
-def test_numbers_that_a_board_prints_become_contacts_on_links(bench: Bench) -> None:
-    """The how-to's commands, with the shipped files."""
+@pytest.fixture(params=["lines", "dbc"])
+def kind(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture
+def sensor(kind: str, case: Case, bench: Bench, tmp_path: Path) -> Iterator[Sensor]:
+    made: Sensor
+    if kind == "lines":
+        made = PtyBoard(tmp_path, case.channels)
+        keys = f'url = "{made.port}"\nlimits = [0, {case.greatest}]'
+        channels = [str(k + 1) for k in range(case.channels)]
+    else:
+        port = find_port()
+        made = CanHand(bench.start, port, case.channels)
+        keys = f'file = "hand.dbc"\n{bench.bus.partition("options")[0]}options = {{ port = {port} }}'
+        channels = [f"c{k}" for k in range(case.channels)]
+        messages = [
+            f"BO_ {300 + k} M{k}: 8 HAND\n"
+            + "".join(f' SG_ c{k + i} : {16 * i}|16@1- (1,0) [0|0] "" HAND\n' for i in range(4))
+            for k in range(0, case.channels, 4)
+        ]
+        (tmp_path / "hand.dbc").write_text('VERSION ""\nNS_ :\nBS_:\nBU_: HAND\n' + "".join(messages))
+    deployment = bench.write_hand(case.text, *URDF_OF_SHIPPED if "urdf" in case.text else ())
+    (pad,) = [entry.pad for entry in deployment.pads if entry.pad.link == case.link]
+    node = bench.write_node(
+        f'[source.sensor]\nkind = "{kind}"\nrate_hz = {1e3 / PERIOD_MS}\n{keys}\n'
+        f'[[pad]]\nname = "{case.link}"\nnode_id = {pad.node_id}\nserial = {pad.serial or 1}\n'
+        f'source = "sensor"\n{case.unit}\nchannels = {channels}\n'.replace("'", '"')
+    )
+    made.plug()
+    bench.serve(node)
+    yield made
+    made.unplug()
+
+
+URDF_OF_SHIPPED = (("two_finger.urdf", str(shipped.path("two_finger.urdf"))),)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_values_of_a_sensor_become_contacts_until_it_is_unplugged(
+    sensor: Sensor, case: Case, bench: Bench
+) -> None:
+    """A contact begins, moves and ends. Unplugged, the pad is unknown, and no old value is shown for new;
+    plugged in again, it detects contacts."""
+    deployment = load(bench.config)
+
+    def press(at: tuple[float, float]) -> Any:
+        sensor.counts = case.values(deployment, at)
+        return case.position_m(deployment, at)
+
+    def is_near(message: Any, place: Any) -> bool:
+        is_located = isinstance(message, wire.Contact) and message.position_m is not None
+        return is_located and bool(np.linalg.norm(np.subtract(message.position_m, place)) < 0.5e-3)
+
+    def press_until_located(at: tuple[float, float]) -> int:
+        place = press(at)
+        return int(client.wait_for(lambda message: is_near(message, place))[-1].id)
+
+    with Client(bench, case.link) as client:
+        client.wait_for_state("clear")
+        first, second = PRESSES
+        moved = (press_until_located(first) == press_until_located(second) for _ in range(MAX_TRIES))
+        assert any(moved)  # a machine that pauses for ten samples ends a contact
+        sensor.counts = [0] * case.channels
+        client.wait_for_event("end")
+
+        last_id = press_until_located(first)
+        sensor.unplug()
+        unplugged_ns = time.monotonic_ns()
+        shown = client.wait_for_state("stale")
+        shown += client.wait_for(lambda message: getattr(message, "event", "") == "end")
+        updates = [message for message in shown if getattr(message, "event", "") == "update"]
+        assert all(message.t_ns <= unplugged_ns + LATE_NS for message in updates if message.fresh)
+        bench.wait_for_output(f"ERROR handtouch.node: pad {case.link}: ")
+
+        sensor.counts = [0] * case.channels
+        sensor.plug()
+        client.wait_for_state("clear")
+        assert press_until_located(second) > last_id
+
+
+def test_the_commands_of_the_how_to_show_contacts_on_links(bench: Bench) -> None:
+    """With the shipped files."""
     shipped_node = (ROOT / "config" / "board_node.toml").read_text()
     node = bench.write_node(shipped_node[shipped_node.index("[source.board]") :])
+    bench.write_hand(CASES["four electrodes"].text, *URDF_OF_SHIPPED)
     board = bench.start(str(ROOT / "examples" / "print_board.py"), stdout=subprocess.PIPE)
     assert board.stdout is not None
     with board.stdout:
         bench.start("-m", "handtouch", "node", str(node), stdin=board.stdout)
     bench.start("-m", "handtouch", "run", str(bench.config))
-    found = bench.contacts(60)
-    assert {contact.link for contact in found} == {"thumb_tip", "index_tip"}
-    for contact in found:
-        if contact.link == "thumb_tip":  # a plate of 30 mm, touched along its middle
-            assert contact.position_m is not None
-            x_m, y_m, _ = contact.position_m
-            assert abs(x_m) < 0.008 if abs(y_m) < 0.001 else abs(x_m) < 0.001
-        assert contact.force_n is not None
-        assert 0.2 < contact.force_n < 5
-
-
-def test_raw_can_frames_become_contacts_on_links(bench: Bench, tmp_path: Path) -> None:
-    """A hand's own bus has its frames; here it is the same bus, between programs."""
-    (tmp_path / "hand.dbc").write_text(DBC)
-    node = bench.write_node(
-        f'[source.hand]\nkind = "dbc"\nfile = "hand.dbc"\nrate_hz = {1e3 / PERIOD_MS}\n{bench.bus}'
-        '[[pad]]\nname = "thumb_tip"\nnode_id = 1\nserial = 1\nsource = "hand"\n'
-        f'ma_per_unit = {MA_PER_UNIT}\nchannels = ["x0", "xa", "y0", "yb"]\n'
-    )
-    sender = tmp_path / "hand.py"
-    deployment = load(shipped.path("two_finger.toml"))
-    pad = deployment.pads[0].pad
-    network = pad_network(pad, deployment.sheets[pad.sheet])
-    fractions = network.fractions(0.4 * network.a, 0.6 * network.b)
-    counts = np.rint(fractions * 2.0 / MA_PER_UNIT).astype(int).tolist()
-    sender.write_text(
-        "import struct, time, can\n"
-        f"bus = can.Bus(interface='udp_multicast', channel={CHANNEL!r}, {bench.options[12:-2]})\n"
-        "while True:\n"
-        f"    counts = {counts} if time.time() % 1 > 0.5 else [0] * 4\n"
-        "    data = struct.pack('<4h', *counts)\n"
-        "    bus.send(can.Message(arbitration_id=300, data=data, is_extended_id=False))\n"
-        f"    time.sleep({1e-3 * PERIOD_MS})\n"
-    )
-    bench.start(str(sender))
-    bench.start("-m", "handtouch", "node", str(node))
-    bench.start("-m", "handtouch", "run", str(bench.config))
-    found = bench.contacts(10)
-    assert {contact.link for contact in found} == {"thumb_tip"}
-    expected_m = (0.4 * network.a, 0.6 * network.b)
-    for contact in found:
-        assert contact.pad_m == pytest.approx(expected_m, abs=0.5e-3)
+    links = set()
+    with Client(bench, "*") as client:
+        for _ in range(60):
+            found = client.wait_for(lambda message: getattr(message, "position_status", "") == "valid")
+            contact: wire.Contact = found[-1]
+            links.add(contact.link)
+            assert contact.force_n is not None
+            assert 0.2 < contact.force_n < 5
+            if contact.link == "thumb_tip":  # a plate of 30 mm, touched along its middle
+                assert contact.position_m is not None
+                x_m, y_m, _ = contact.position_m
+                assert abs(x_m) < 0.008 if abs(y_m) < 0.001 else abs(x_m) < 0.001
+    assert links == {"thumb_tip", "index_tip"}

@@ -1,6 +1,6 @@
 """The skin's weight on a hand that turns over, end to end: real daemon, nodes and joint states.
 
-The robot reports it as its arm's `gravity` with the joint states.
+Twice, as a robot reports it: by its arm's `gravity` with the joint states, and by the joints of its URDF.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ import re
 from typing import Any
 
 import numpy as np
+import pytest
 
 from handtouch import columns, config, wire
+from handtouch.config import shipped
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
@@ -40,13 +42,35 @@ duration_s = 120.0
 axis = [1.0, 0.3, 0.0]
 rev_s = 1.0
 """
+BY_JOINTS = f"""
+[[joint]]
+joints = ["wrist"]
+from_s = 1.0
+duration_s = {LEARNT_S - 1}
+position_deg = [0.0, 1440.0]
+
+[[joint]]
+joints = ["wrist"]
+from_s = {LEARNT_S}
+duration_s = {4 * FAST_S}
+position_deg = [1440.0, {1440 + 4 * 360 * FAST_S}]
+"""
 
 
-def prepare(rig: Any) -> None:
-    """Write the scenario and low thresholds."""
-    rig.scenario.write_text(SKIN + TOUCH + BY_GRAVITY)
+def prepare(rig: Any, motion: str) -> None:
+    """Write the scenario, low thresholds, and a URDF whose wrist turns."""
+    rig.scenario.write_text(SKIN + TOUCH + motion)
+    urdf = shipped.path("utah_mit.urdf").read_text()
+    urdf, changed = re.subn(
+        r'<joint name="wrist" type="fixed">(.*?)</joint>',
+        r'<joint name="wrist" type="continuous">\1<axis xyz="0 1 0.3"/></joint>',
+        urdf,
+    )
+    assert changed == 1
+    (rig.folder / "turning.urdf").write_text(urdf)
     head, *pads = re.split(r"(?=^\[\[hand\.pad\]\])", rig.config.read_text(), flags=re.MULTILINE)
     text = head + "".join(pad for pad in pads if any(f'link = "{link}"' in pad for link in LINKS))
+    text = re.sub(r'urdf = "[^"]*"', 'urdf = "turning.urdf"', text)
     text = text.replace("begin_threshold_n = 0.06", "begin_threshold_n = 0.03")
     rig.config.write_text(text.replace("end_threshold_n = 0.03", "end_threshold_n = 0.015"))
 
@@ -58,11 +82,12 @@ def weight_std_counts(rig: Any) -> float:
     hand = VirtualHand(deployment, scenario, WORLDS["ideal"].draw(1))
     (pad,) = (one for one in hand.virtual_pads if one.pad.link == UNTOUCHED)
     times_s = LEARNT_S + 2 + np.arange(200) / 50
-    return float(np.std((pad.skin_currents(times_s) * pad.counts_per_ampere).sum(axis=1)))
+    return float(np.std((pad.load_currents(times_s) * pad.counts_per_ampere).sum(axis=1)))
 
 
-def test_a_hand_that_turns_over_once_a_second_has_no_contact_but_the_touch(rig: Any) -> None:
-    prepare(rig)
+@pytest.mark.parametrize("motion", [BY_GRAVITY, BY_JOINTS], ids=["gravity", "joints"])
+def test_a_hand_that_turns_over_once_a_second_has_no_contact_but_the_touch(rig: Any, motion: str) -> None:
+    prepare(rig, motion)
     rig.simulate("--world", "ideal")
     rig.start("run")
     rig.wait_operational(len(LINKS))

@@ -47,7 +47,7 @@ def angles(t_ns: int) -> dict[str, float]:
 def palm_of(point_m: tuple[float, ...], t_ns: int) -> NDArray[np.float64]:
     """Transform a point of the index finger's last link to the palm by its joints' transforms."""
     point, positions = np.array(point_m), angles(t_ns)
-    for joint in reversed(ROBOT.joints_between(LINK, "palm")):
+    for joint in reversed(ROBOT.joint_chain(LINK)[len(ROBOT.joint_chain("palm")) :]):
         rotation = Rotation.from_rotvec(joint.axis * positions[joint.name]).as_matrix()
         point = joint.rotation @ rotation @ point + joint.translation_m
     return np.asarray(point)

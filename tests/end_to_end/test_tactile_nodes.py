@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from handtouch import wire
@@ -55,6 +57,30 @@ def test_a_daemon_and_a_policys_features_see_what_a_simulated_grip_presses(tmp_p
         assert [values[f"{tip}.touched"] for tip in TIPS] == [1, 1]
         nodes.update(None)
         wait_for(hand, wire.PadState.CLEAR)
+
+
+@pytest.mark.timeout(900)  # the daemon's tables and 40 readings, in slow motion
+def test_the_daemon_senses_a_bolt_as_the_pipeline_in_the_simulations_process() -> None:
+    from handtouch.simulate.tactile.bolt_scene import BoltStart
+    from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell
+
+    palm_up = np.array([0.0, 0.0, 0.3]), np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    readings = []
+    for slower in (0, 8):
+        cell = BoltWorkcell(1, BoltStart(0.0, 0.0, 0.0), "ideal", slower=slower)
+        with contextlib.closing(cell):
+            straight = np.zeros(len(cell.joints))
+            cell.start_at(palm_up, straight)
+            cell.scene.model.opt.gravity[2] = -50.0  # so that a bolt on the palm is no light touch
+            cell.scene.place_bolt(np.array([0.08, 0.0, 0.33]), np.array([0.0, 1.0, 0.0]))
+            touch = [cell.move(palm_up, straight).touch for _ in range(40)][-1]
+        readings.append(touch)
+    here, served = readings
+    touched = here.touched
+    assert touched.any()
+    assert (served.touched == touched).all()
+    assert served.position_m[touched] == pytest.approx(here.position_m[touched], abs=1e-3)
+    assert served.force_n[touched] == pytest.approx(here.force_n[touched], rel=0.2)
 
 
 def test_pads_on_several_buses_and_unknown_worlds_are_refused() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch.field.contact_law import (
@@ -21,7 +21,6 @@ from handtouch.field.contact_law import (
     contact_stack_resistance,
 )
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.sandwich import Sandwich
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -265,97 +264,3 @@ class TestDoubt:
         assert found.status[1] in (ForceEstimateStatus.INVALID, ForceEstimateStatus.LOWER_BOUND)
         assert (found.status[1] == ForceEstimateStatus.INVALID) == math.isnan(bad)
         assert law.force(1e-3, DRIVE, SHEET, math.nan).status == ForceEstimateStatus.INVALID
-
-
-class TestSandwich:
-    PAIR = Sandwich((2e-2, 2e-2), (1.0, 2.0), (SHEET, SHEET))
-
-    @given(force=st.floats(0.01, 0.5), radius=st.floats(8e-4, 6e-3), swap=st.booleans())
-    def test_force_and_radius_are_recovered(self, force: float, radius: float, swap: bool) -> None:
-        pair = Sandwich((2e-2, 2e-2), (2.0, 1.0), (SHEET, SHEET)) if swap else self.PAIR
-        found = pair.force(pair.currents(force, radius, DRIVE, SPREADING, SERIES), DRIVE, SPREADING, SERIES)
-        assert found.force_n == pytest.approx(force, rel=1e-7)
-        assert found.radius_m == pytest.approx(radius, rel=1e-7)
-
-    @given(
-        force=st.floats(0.01, 1e5),
-        radius=st.floats(3e-4, 8e-3),
-        alpha=st.sampled_from([(1.5, 0.7), (0.7, 1.5), (1.0, 2.0), (0.5, 0.6)]),
-    )
-    @example(force=1.5, radius=5e-4, alpha=(1.5, 0.7))
-    @example(force=1e3, radius=5e-4, alpha=(1.5, 0.7))
-    @example(force=84995.0, radius=3e-4, alpha=(1.0, 2.0))
-    def test_force_is_recovered_or_a_lower_bound(
-        self, force: float, radius: float, alpha: tuple[float, float]
-    ) -> None:
-        pair = Sandwich((2e-2, 3e-2), alpha, (2400.0, 3000.0))
-        found = pair.force(pair.currents(force, radius, 12.0, 2e-2), 12.0, 2e-2)
-        assert found.status in (ForceEstimateStatus.VALID, ForceEstimateStatus.LOWER_BOUND)
-        if found.status == ForceEstimateStatus.VALID:
-            assert found.force_n == pytest.approx(force, rel=1e-6)
-            assert found.radius_m == pytest.approx(radius, rel=1e-6)
-        else:
-            assert 0 < found.force_n <= force * (1 + 1e-8)
-            assert np.isinf(np.diagonal(found.covariance)).all()
-
-    def test_currents_beyond_the_sheets_limits_give_a_lower_bound(self) -> None:
-        pair = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
-        most = pair.currents(1e9, 1e-2, 12.0, 2e-2)
-        found = pair.force(most[:, None] * [0.7, 1.1, 5.0, 1e6], 12.0, 2e-2)
-        assert (found.status == ForceEstimateStatus.LOWER_BOUND).all()
-        assert (found.force_n > 1).all()
-        assert np.isfinite(found.force_n).all()
-
-    def test_impossible_contact_is_invalid_and_no_current_below_threshold(self) -> None:
-        good = self.PAIR.currents(0.2, 2e-3, DRIVE, SPREADING)
-        readings = np.stack([good, good * [1, math.nan], good * [1, 0], good * [1, -1], good * [1e-3, 1]], 1)
-        found = self.PAIR.force(readings, DRIVE, SPREADING, current_std_a=1e-9)
-        assert list(found.status) == [
-            ForceEstimateStatus.VALID,
-            ForceEstimateStatus.INVALID,
-            ForceEstimateStatus.BELOW_THRESHOLD,
-            ForceEstimateStatus.BELOW_THRESHOLD,
-            ForceEstimateStatus.INVALID,
-        ]
-        assert (np.isnan(found.force_n) == (found.status != ForceEstimateStatus.VALID)).all()
-
-    def test_of_two_fitting_radii_the_lesser_force_is_a_bound(self) -> None:
-        force, radius = np.meshgrid(np.geomspace(0.01, 100, 25), np.geomspace(5e-4, 8e-3, 15))
-        found = self.PAIR.force(self.PAIR.currents(force, radius, DRIVE, SPREADING), DRIVE, SPREADING)
-        known = found.status == ForceEstimateStatus.VALID
-        assert known[force < 0.3].all()
-        assert not known.all()
-        assert found.force_n[known] == pytest.approx(force[known], rel=1e-6)
-        assert found.radius_m[known] == pytest.approx(radius[known], rel=1e-6)
-        assert (found.status[~known] == ForceEstimateStatus.LOWER_BOUND).all()
-        assert (found.force_n[~known] <= force[~known] * (1 + 1e-8)).all()
-
-    def test_covariance_equals_the_scatter_of_a_simulation(self) -> None:
-        currents = self.PAIR.currents(0.2, 2e-3, DRIVE, SPREADING)
-        noise = 0.004 * currents
-        drawn = currents[:, None] + noise[:, None] * np.random.default_rng(7).standard_normal((2, 20_000))
-        found = self.PAIR.force(drawn, DRIVE, SPREADING)
-        scatter = np.cov(np.stack([found.force_n, found.radius_m]))
-        expected = self.PAIR.force(currents, DRIVE, SPREADING, current_std_a=noise).covariance
-        assert expected == pytest.approx(scatter, rel=0.06)
-
-    def test_finger_and_pin_of_equal_current_are_distinguished(self) -> None:
-        """One sheet alone takes the one for the other."""
-        currents = self.PAIR.currents([0.2, 0.2], [1e-3, 4e-3], DRIVE, SPREADING)
-        found = self.PAIR.force(currents, DRIVE, SPREADING)
-        assert found.force_n[0] == pytest.approx(found.force_n[1])
-        assert found.radius_m[1] / found.radius_m[0] == pytest.approx(4.0)
-
-    def test_shapes_nan_and_rejections(self) -> None:
-        currents = self.PAIR.currents(np.full((2, 3), 0.2), 2e-3, DRIVE, SPREADING)
-        currents[0, 1, 1] = math.nan
-        currents[1, 0, 0] = -1e-3
-        found = self.PAIR.force(currents, DRIVE, SPREADING, current_std_a=1e-6)
-        assert found.covariance.shape == (2, 3, 2, 2)
-        assert np.isnan(found.force_n).sum() == 2
-        with pytest.raises(ValueError, match="alpha"):
-            Sandwich((2e-2, 2e-2), (1.0, 1.0), (SHEET, SHEET))
-        with pytest.raises(ValueError, match="contact_ohm_m2"):
-            Sandwich((0.0, 2e-2), (1.0, 2.0), (SHEET, SHEET))
-        with pytest.raises(ValueError, match="two sheets"):
-            self.PAIR.force([1e-3], DRIVE, SPREADING)

@@ -11,7 +11,6 @@ import pytest
 
 from handtouch.field.contact_law import ContactLaw, contact_stack_resistance
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.sandwich import Sandwich
 from handtouch.field.surface import (
     AnisotropicSurface,
     ConeSurface,
@@ -28,7 +27,6 @@ BOTH = np.stack([X, Y])
 FOUR = np.stack(np.broadcast_arrays(X, Y, 0.2, 0.3))
 
 FIXED, SIZED = ContactLaw(2e-2, 1.5, 2e-3, 3e-4), ContactLaw(2e-2, 1.5, 2e-3, 3e-4, hertz_n=1.0)
-PAIR = Sandwich((2e-2, 3e-2), (1.5, 0.7), (2400.0, 3000.0))
 
 SURFACES: list[Callable[[], Any]] = [
     lambda: PlaneSurface(1.3, 1.0),
@@ -54,9 +52,6 @@ WEIGHINGS: dict[str, Callable[[], object]] = {
     "current": lambda: (FIXED.current(X, 5.0, 2400.0, Y), SIZED.current(X, 5.0, 2400.0, Y)),
     "force": lambda: [law.force(X, 5.0, 2400.0, Y, current_std_a=1e-4) for law in (FIXED, SIZED)],
     "terms": lambda: ContactLaw(1e-300, 3.0, 1e-200, 1e-300, 1e300).force(1e-3, 5.0, 2400.0, 0.017),
-    "sandwich currents": lambda: (PAIR.currents(X, Y, 12.0, 0.02), PAIR.currents(0.2, X, Y, 0.02)),
-    "sandwich force": lambda: PAIR.force(BOTH, 12.0, 0.02, current_std_a=1e-4),
-    "sandwich place": lambda: PAIR.force(np.full((2, X.size), 1e-3), 12.0, X, Y),
 }
 
 

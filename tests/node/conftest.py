@@ -20,12 +20,13 @@ Frame = tuple[int, bytes]
 
 
 class Wire:
-    """A bus that remembers what was sent, and gives what is put in `incoming`."""
+    """A bus that remembers what was sent, and gives what is put in `incoming`; `file`: to wait for."""
 
     def __init__(self) -> None:
         self.sent: list[Frame] = []
         self.incoming: list[can.Message] = []
         self.filters: Any = None
+        self.file: int | None = None
 
     def recv(self, timeout: float | None = None) -> can.Message | None:  # noqa: ARG002
         return self.incoming.pop(0) if self.incoming else None
@@ -35,6 +36,11 @@ class Wire:
 
     def set_filters(self, filters: Any) -> None:
         self.filters = filters
+
+    def fileno(self) -> int:
+        if self.file is None:
+            raise NotImplementedError
+        return self.file
 
 
 class NodeBench:

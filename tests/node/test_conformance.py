@@ -44,6 +44,9 @@ class ServedLine:
     def set_filters(self, filters: Any) -> None:
         """Pass every frame."""
 
+    def fileno(self) -> int:
+        raise NotImplementedError
+
     # as both
     def send(self, frame: Any, data: bytes = b"", remote: bool = False) -> None:
         if isinstance(frame, can.Message):

@@ -8,6 +8,8 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import pytest
+
 from handtouch.node.adc_fault import AdcFaultKind, emergency_of
 from handtouch.node.settings import load
 
@@ -31,6 +33,31 @@ def test_the_diagram_has_the_channels_gain_and_line_of_the_shipped_node() -> Non
     assert any(str(text).startswith(f"{-pad.gain_ohm:g} Ω") for text in texts)
     assert pad.excitation is not None
     assert f"GPIO {pad.excitation.line}" in texts
+
+
+def test_the_how_to_s_values_of_a_board_make_a_node(tmp_path: Path) -> None:
+    """Its full scale is within what the sketch can print, in the unit that it states."""
+    page = (ROOT / "docs/howto.md").read_text()
+    steps = page[page.index("With an Arduino UNO") : page.index("## ... equip an Allegro hand")]
+    text = (ROOT / "config/board_node.toml").read_text().rpartition("[[pad]]")[0]
+    keys = re.findall(r"`(\w+ = [^`]+)`", steps[: steps.index("\n2. ")])
+    assert len(keys) == 5
+    for key in keys:
+        name = key.split(" = ")[0]
+        if name == "limits":
+            text = text.replace("[source.board]", f"[source.board]\n{key}")
+        else:
+            text, changed = re.subn(rf"^{name} = .*", key, text, count=1, flags=re.MULTILINE)
+            assert changed == 1, name
+    (tmp_path / "node.toml").write_text(text)
+    node = load(tmp_path / "node.toml").settings
+    (pad,) = node.pads
+    reference_mv, steps_of_adc, readings, shunt_ohm = 1100, 1024, 16, 220
+    assert f"/ {steps_of_adc} / {readings} / {shunt_ohm} ohm" in steps
+    assert pad.ma_per_unit == pytest.approx(reference_mv / steps_of_adc / readings / shunt_ohm, rel=1e-3)
+    assert node.sources["board"].limits == (0, readings * (steps_of_adc - 1))
+    assert f"full_scale_ma = {pad.full_scale_ma}" in steps[steps.index("\n3. ") :]
+    assert f"series_ohm = {[shunt_ohm] * 4}" in steps
 
 
 def test_the_page_has_every_kind_of_failure_with_its_emcy_message() -> None:

@@ -15,4 +15,4 @@ def test_estimates_of_unproven_kinds_are_labelled_experimental_on_the_wire(kind:
     sent = make_percept_message(estimate, "right", "index_distal")
     received = unpack_output(pack_message(sent))
     assert isinstance(received, wire.Percept)
-    assert received.experimental == (kind in ("shape", "object"))
+    assert received.experimental == (kind in ("shape", "object", "stiffness"))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.slip import MOTION_CLASSES
+from handtouch.core.stages.slip import MOTION_CLASSES, SlipDetector
 from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.state import TickState
 from handtouch.percept.motion import MotionReporter
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
@@ -28,7 +28,10 @@ class Held:
         self._values = np.full((pads, VALUE_COUNT), np.nan)
         self._current_a, self._times = np.zeros(pads), np.zeros(pads, dtype=np.int64)
         self._ids = np.arange(1, pads + 1, dtype=np.uint32)
-        self.slip = SlipDetector(PERIOD_NS * 1e-9, self._values, self._current_a, self._times, self._ids)
+        held = TickState.empty(pads)
+        self.slip = SlipDetector(
+            PERIOD_NS * 1e-9, self._values, self._current_a, self._times, self._ids, held
+        )
         self.slip.set_requested(np.ones(pads, dtype=np.bool_))
         self.poses = ContactBuffer(pads, length=22)
         self.reporter = MotionReporter(self.slip, self.poses, PERIOD_NS * 1e-9)

@@ -18,7 +18,8 @@ from handtouch.percept.samples import ContactBuffer, ContactSamples, HandSnapsho
 
 FloatArray = NDArray[np.float64]
 POINT_STD_M, NORMAL_STD_RAD = 4e-4, 0.1
-CHI2_6_95 = 12.59
+CHI2_3_95, CHI2_6_95 = 7.81, 12.59
+MAX_DISTANCES_OF_CONTACTS, MAX_DISTANCES_WITH_PADS = 4_000, 40_000
 SHAPES: dict[str, dict[str, Any]] = {
     "sphere": {"diameter_mm": 50.0},
     "box": {"size_mm": (40.0, 100.0, 30.0)},
@@ -46,8 +47,10 @@ def touches(
     return PoseEvidence(
         points,
         normals,
+        np.zeros((c, 3, 3)),
         np.full(c, POINT_STD_M),
         np.full(c, NORMAL_STD_RAD),
+        np.full(c, 0.03),
         np.zeros((0, 1, 3)),
         np.zeros(0),
     )
@@ -187,6 +190,20 @@ def towards_head(hypotheses: list[PoseHypothesis]) -> tuple[float, float]:
     )  # type: ignore[return-value]
 
 
+def test_a_cylinder_touched_on_its_side_is_free_along_its_axis() -> None:
+    shape, rotation = build_shape(table("cylinder")), Rotation.random(random_state=2)
+    angles, along = np.arange(6) * np.pi / 3, np.array([-8.0, 0.0, 8.0, -8.0, 0.0, 8.0]) * 1e-3
+    outward = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(6)])
+    feet = 15e-3 * outward + along[:, None] * [0.0, 0.0, 1.0]
+    best = sampled(shape, touches(rotation, np.zeros(3), (feet, outward), 1)).hypotheses[0]
+    own_axis = rotation.apply([0.0, 0.0, 1.0])
+    variance = best.covariance[:3, :3]
+    along_m2 = own_axis @ variance @ own_axis
+    assert along_m2 > 8e-3**2
+    assert np.trace(variance) - along_m2 < 2 * 1e-3**2
+    assert abs(best.position_m @ own_axis) < 3 * np.sqrt(along_m2)
+
+
 def test_which_end_is_the_head_stays_open_until_an_untouched_pad_excludes_one() -> None:
     shape, evidence = shank_touches()
     up, down = towards_head(sampled(shape, evidence).hypotheses)
@@ -215,6 +232,7 @@ class Hand:
         self.estimator = ObjectEstimator(np.full((PADS, 1, 3), 10.0))
         self.estimator.requested[:] = True
         self.rotation, self.origin_m = np.tile(np.eye(3), (PADS, 1, 1)), np.zeros((PADS, 3))
+        self.base_m = np.array([1.0, 0.0, 0.0])
 
     def step(
         self, points: FloatArray, normals: FloatArray, contact_id: int = 1, slips: float = 0.0
@@ -231,7 +249,7 @@ class Hand:
             self.buffer.add_samples(sample)
         snapshot = HandSnapshot(
             *(0, 0, self.t_ns, ids, ids == 0, np.full(PADS, slips)),
-            *(self.rotation.copy(), self.origin_m.copy(), np.eye(3), np.array([1.0, 0.0, 0.0])),
+            *(self.rotation.copy(), self.origin_m.copy(), np.eye(3), self.base_m.copy()),
             self.known,
         )
         (found,) = self.estimator.process_hand(self.buffer, snapshot)
@@ -303,6 +321,92 @@ def test_the_pose_recovers_after_a_drop_and_a_regrasp_elsewhere() -> None:
         found = hand.step(turn.apply(points) + shift, turn.apply(normals), contact_id=2)
     assert found.state == "estimated", found.reason
     assert np.linalg.norm(np.array(found.poses[0]["palm_position_m"]) - shift) < 3e-3
+
+
+def test_what_nothing_holds_stays_in_the_base_while_the_palm_moves() -> None:
+    points, normals = feet_of("sphere", 9, 4)
+    hand, way = Hand(known("sphere")), np.array([0.02, 0.0, -0.01])
+    hand.step(points, normals)
+    hand.step(points[:0], normals[:0])
+    hand.base_m = hand.base_m + way
+    hand.step(points[:0], normals[:0])
+    found = hand.step(points[:1] - way, normals[:1], contact_id=2)
+    assert found.evidence["points"] == 4  # three are remembered
+    np.testing.assert_allclose(found.poses[0]["palm_position_m"], -way, atol=2e-3)
+
+
+def test_errors_that_the_points_of_a_pad_share_dont_make_a_pose_sharper() -> None:
+    """Three pads, each off by as much in all of its touches: the sphere is in the 95 % ellipsoid as often."""
+    rng, inside = np.random.default_rng(12), []
+    for trial in range(8):
+        _, normals = feet_of("sphere", 20 + trial, 3)
+        off = 0.5e-3 * rng.normal(size=(3, 1)) * normals - 0.4e-3 * normals  # and the skin gives way
+        hand = Hand(known("sphere"))
+        for _ in range(3):
+            beside = normals + 0.2 * rng.normal(size=(3, 3))
+            beside /= np.linalg.norm(beside, axis=1, keepdims=True)
+            found = hand.step(25e-3 * -beside - off, beside)
+        pose = found.poses[0]
+        covariance = np.array(pose["palm_covariance"]).reshape(6, 6)[:3, :3]
+        position = np.array(pose["palm_position_m"])
+        inside.append(position @ np.linalg.solve(covariance, position) < CHI2_3_95)
+    assert found.evidence["points"] > 4
+    assert np.mean(inside) >= 0.75  # with 95 %, fewer of 8 have a probability of 0.6 %
+
+
+class CountingShape(KnownShape):
+    """A shape that counts the points whose distance was asked."""
+
+    def __init__(self, shape: KnownShape) -> None:
+        super().__init__(shape.half_m, shape.free_axes, shape.symmetries, shape.frame_m)
+        self.shape, self.count = shape, 0
+
+    def distance_and_normal(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        self.count += points.size // 3
+        return self.shape.distance_and_normal(points)
+
+    def counted(self) -> int:
+        """Return the count since the last call."""
+        count, self.count = self.count, 0
+        return count
+
+
+def test_an_update_costs_few_distances_and_known_evidence_almost_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shapes: list[CountingShape] = []
+
+    def counting(stated: ObjectTable) -> KnownShape:
+        shapes.append(CountingShape(build_shape(stated)))
+        return shapes[-1]
+
+    monkeypatch.setattr("handtouch.percept.object_estimator.build_shape", counting)
+    hand = Hand(known("bolt"))
+    points, normals = feet_of("bolt", 11)
+    counts, poses = [], []
+    for _ in range(12):
+        found = hand.step(points, normals)
+        counts.append(shapes[0].counted())
+        poses.append(found.poses)
+    assert max(counts[1:]) < MAX_DISTANCES_OF_CONTACTS
+    assert min(counts) < 0.01 * MAX_DISTANCES_OF_CONTACTS
+    assert poses[-1] == poses[-2]
+
+
+def test_pads_near_the_object_cost_a_bounded_number_of_distances() -> None:
+    shape = CountingShape(build_shape(table("bolt")))
+    feet = shape.surface_points(np.random.default_rng(13), 6)
+    evidence = touches(Rotation.identity(), np.zeros(3), feet, 13)
+    x, y = (part.ravel() for part in np.meshgrid([-8e-3, -3e-3, 3e-3, 8e-3], [-8e-3, -3e-3, 3e-3, 8e-3]))
+    pad = np.stack([x, y, 0 * x], axis=1)
+    turns = np.arange(15.0)
+    middle = np.stack([15e-3 * np.cos(turns), 15e-3 * np.sin(turns), 5e-3 * (turns - 7)], axis=1)
+    free = middle[:, None] + pad
+    evidence = evidence._replace(free_m=free, free_std_m=np.full(15, 1e-3))
+    sampler = sampled(shape, evidence)
+    shape.counted()
+    sampler.update(evidence)
+    assert shape.counted() < MAX_DISTANCES_WITH_PADS
 
 
 def test_contacts_that_no_pose_explains_are_invalid() -> None:

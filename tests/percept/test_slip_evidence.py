@@ -7,15 +7,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.evidence import (
     ALONE_LOG_ODDS,
     MAX_OTHERS_LOG_ODDS,
     OTHERS_WEIGHT,
     SLIP_FEATURES,
 )
-from handtouch.core.stages.slip import SLIP_SLICES
+from handtouch.core.stages.slip import SLIP_SLICES, SlipDetector
 from handtouch.core.stages.solve import VALUE_COUNT
+from handtouch.core.state import TickState
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.percept.slip_evidence import SlipEvidence, SlipTrees
 
@@ -31,7 +31,7 @@ def turned(angle_rad: float) -> FloatArray:
 def detector(n: int) -> SlipDetector:
     """The slip stage of contacts that it knows nothing of."""
     values, times, ids = np.full((n, VALUE_COUNT), np.nan), np.zeros(n, np.int64), np.zeros(n, np.uint32)
-    return SlipDetector(PERIOD_S, values, np.zeros(n), times, ids)
+    return SlipDetector(PERIOD_S, values, np.zeros(n), times, ids, TickState.empty(n))
 
 
 def played(
@@ -197,7 +197,8 @@ def test_motion_against_other_contacts_is_that_of_least_squares() -> None:
     for k in range(80):
         pads = hands.tick(k)
         found = evidence.features(pads)
-        ratio, slipping = (hands.slip.column(name) for name in ("log_ratio", "slipping"))
+        contacts = hands.slip.contacts()
+        ratio, slipping = contacts.log_ratio, contacts.slipping
         for window_s in (0.02, 0.05, 0.1):
             at = SLIP_FEATURES.index(f"relative_mm_{1e3 * window_s:.0f}ms")
             true = [
@@ -245,7 +246,7 @@ def test_velocity_against_the_object_is_that_of_least_squares() -> None:
         pads = hands.tick(k)
         log_odds = hands.rng.normal(-4.0, 4.0, hands.PADS)
         hands.slip.state[:, SLIP_SLICES["log_odds"].start] = log_odds
-        sticks = (hands.slip.column("slipping") == 0) & (log_odds <= -3)
+        sticks = (hands.slip.contacts().slipping == 0) & (log_odds <= -3)
         evidence.compute_velocities(10**9 + 5_000_000 * k)
         for pad in range(hands.PADS) if k > 12 else ():
             found = evidence.relative_motion(pad)

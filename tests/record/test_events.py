@@ -34,13 +34,14 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> RecordingSession:
 
 def test_reference_forces_and_gravity_are_replayed_from_any_state(session: RecordingSession) -> None:
     hand, random = session.hand, np.random.default_rng(3)
-    hand.pipeline.tick.baseline.gravity_slope[:] = random.normal(0, 5, (2, 4, 3))  # so that it has an effect
+    load = hand.pipeline.tick.baseline.link_load
+    load.coefficients[:] = random.normal(0, 5, load.coefficients.shape)  # so that it has an effect
     session.send_retained()
     samples = {0: hand.counts(0, 0.4, 0.3, 1e-3), 1: hand.counts(1, 0.5, 0.6, 2e-3)}
     for tick in range(600):
         if tick % 20 == 0:
             down = random.normal(size=(2, 3))
-            hand.pipeline.set_gravity(down / np.linalg.norm(down, axis=1, keepdims=True))
+            hand.pipeline.set_felt_gravity(down / np.linalg.norm(down, axis=1, keepdims=True))
         if tick == 300:
             session.send_retained()
         if tick % 30 == 15 and tick > 300:
@@ -56,7 +57,7 @@ def test_reference_forces_and_gravity_are_replayed_from_any_state(session: Recor
         hand.step(samples if tick > 40 else {0: b"\0" * 8, 1: b"\0" * 8})
     gains = hand.pipeline.tick.sheet_force.log_gain
     assert (np.abs(gains) > 0.02).all()
-    assert hand.pipeline.tick.baseline.gravity.any()
+    assert hand.pipeline.tick.baseline.link_load.felt.any()
     hand.pipeline.end_session(hand.t_ns + PERIOD_NS)
     session.recorder.finish()
     with_events = sum(len(m.events) > 0 for m in hand.sink.messages if isinstance(m, wire.TickInputs))

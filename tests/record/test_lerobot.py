@@ -20,11 +20,13 @@ parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra export"
 JOINTS = ("base_joint", "tip_joint")
 
 
-def joints(seq: int, t_ns: int) -> list[bytes]:
-    """Return joint positions that tell their time."""
+def joints(seq: int, t_ns: int, known: int = len(JOINTS)) -> list[bytes]:
+    """Return joint positions, the first `known` of them, that tell their time."""
+    positions, ages = (1e-9 * t_ns, 0.5), (0.0, 0.0)
+    unknown = (None,) * (len(JOINTS) - known)
     message = wire.JointPositions(
-        v=1, session=7, seq=seq, t_ns=t_ns, hand="h", names=JOINTS, position_rad=(1e-9 * t_ns, 0.5),
-        age_s=(0.0, 0.0), retained=False,
+        v=1, session=7, seq=seq, t_ns=t_ns, hand="h", names=JOINTS,
+        position_rad=positions[:known] + unknown, age_s=ages[:known] + unknown, retained=False,
     )  # fmt: skip
     return wire.encode(message)
 
@@ -37,10 +39,10 @@ class Recorded:
         self.frames: list[wire.HandFrame] = []
         self._seq = 0
 
-    def stroke(self, ticks: int, with_joints: bool = True) -> None:
+    def stroke(self, ticks: int, with_joints: bool = True, known: int = len(JOINTS)) -> None:
         for _ in range(ticks):
             if with_joints and self._seq % 4 == 0:
-                self.session.take(joints(self._seq + 1, self.hand.t_ns))
+                self.session.take(joints(self._seq + 1, self.hand.t_ns, known))
             self._seq += 1
             self.hand.stroke_step(self._seq % 40 / 40, np.random.default_rng(self._seq))
 
@@ -139,6 +141,14 @@ def test_a_recording_without_joints_or_before_them_has_no_invented_state(
     state_s = rows(tmp_path / "set")[STATE][:, 0]
     assert state_s[0] == pytest.approx(1e-9 * first_ns, abs=4e-9 * PERIOD_NS)
     assert len(state_s) == pytest.approx(50, abs=2)
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_joints_that_were_never_known_are_left_out(recorded: Recorded, tmp_path: Path, known: int) -> None:
+    recorded.stroke(100, known=known)
+    counts = export_lerobot(recorded.finish(), tmp_path / "set", fps=100.0)
+    assert counts.joints == JOINTS[:known]
+    assert len(rows(tmp_path / "set")["timestamp"]) == pytest.approx(50, abs=3)
 
 
 @pytest.mark.parametrize(

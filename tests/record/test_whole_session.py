@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.calibration.auto_calibration import CalibrationState
-from handtouch.calibration.calibration import LawParameters
+from handtouch.calibration.calibration import CalibrationState, LawParameters
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import SerialChanged
@@ -216,7 +215,7 @@ def entries(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedMessage]:
     session.rest(10, PadState.LOST)
     session.stroke(40, 9)
     down = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]])
-    pipeline.set_gravity(down)
+    pipeline.set_felt_gravity(down)
     pipeline.add_event(SamplingEvent((True, False), (PERIOD_NS, 20 * PERIOD_NS), (1,)))
     session.stroke(60, 10)
     pipeline.end_session(hand.t_ns + PERIOD_NS)

@@ -142,3 +142,13 @@ def test_pads_of_one_material_are_evidence_for_a_pad_that_was_not_touched() -> N
 def test_a_pad_that_adapts_differs_from_others_of_its_material() -> None:
     rejected = Pads([False, False, False, False, True, False]).bank.rejected
     assert rejected.tolist() == [True, True, True, True, False, True]
+
+
+@pytest.mark.parametrize("loads", [(1e-3, 1e30), (1e-30, 1e30)])
+def test_readings_that_no_model_explains_are_evidence_for_none(loads: tuple[float, float]) -> None:
+    state = BankState.empty(1)
+    bank = ModelBank(S1.adaptation, BankPrior(), state)
+    for age_s in range(1, 300):  # windows end when the age has doubled
+        bank.advance(np.array([loads[age_s.bit_length() % 2]]), np.ones(1), np.array([float(age_s)]))
+    for part in ("log_weight", "back_n", "exponent", "exponent_variance", "growth"):
+        assert np.isfinite(getattr(state, part)).all(), part

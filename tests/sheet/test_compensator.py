@@ -35,19 +35,18 @@ SWELLING = replace(S2, temperature=TemperatureResponse(0.01, 0.002), fluctuation
 models = st.sampled_from([replace(S1, fluctuation=Fluctuation()), SWELLING, WHOLE])
 
 
-@given(models, st.integers(0, 2**32), st.floats(-8, 8))
-def test_the_load_on_a_known_sheet_is_recovered(model: SheetModel, seed: int, warmer_k: float) -> None:
-    """To 1e-9, for presses, changes, releases and pauses, at any intervals and temperatures."""
+@given(models, st.integers(0, 2**32))
+def test_the_load_on_a_known_sheet_is_recovered(model: SheetModel, seed: int) -> None:
+    """To 1e-9, for presses, changes, releases and pauses, at any intervals."""
     draws = np.random.default_rng(seed)
     state, compensator = (
         model.initial_state(PADS),
         SheetCompensator(model, PADS, ParameterUncertainty.exact()),
     )
-    compensator.set_temperature_rise(warmer_k)
     for _ in range(80):
         dt = float(10 ** draws.uniform(-3, 0.5))
         load = draws.uniform(0.5, 5, PADS) * (draws.random(PADS) < 0.7)
-        apparent = model.discretise(dt).forward(state, load, warmer_k=warmer_k)
+        apparent = model.discretise(dt).forward(state, load)
         np.testing.assert_allclose(compensator.compensate(apparent, dt), load, atol=1e-9)
         assert (compensator.std_n()[load > 0] < 1e-9).all()
     np.testing.assert_allclose(compensator.back_n, state.adaptation.back_n, atol=1e-9)
@@ -213,13 +212,6 @@ class TestHistory:
         cold, warm, off = (float(history.apparent_n(t)[0]) for t in (0.995, 1.995, 2.5))
         assert warm / cold == pytest.approx(1.1, abs=0.02)
         assert off == 0
-
-    def test_the_ratio_of_loads_is_that_of_the_layer(self) -> None:
-        history = self.history()
-        np.testing.assert_array_equal(
-            history.load_ratio(0.5), [0, history.apparent_n(0.5)[1] / (1 + np.sin(0.5))]
-        )
-        assert 0.3 < history.load_ratio(1.05)[0] < history.load_ratio(1.99)[0] < 1.3
 
     def test_the_result_depends_little_on_the_grid(self) -> None:
         calm = replace(S1, fluctuation=Fluctuation())

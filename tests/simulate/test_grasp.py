@@ -9,6 +9,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from benchmarks import grasp_run
+from benchmarks.event_score import (
+    EventScore,
+    compare_contacts,
+    ideal_contact_spans,
+    merge_spans,
+    touch_spans,
+)
 from handtouch import config
 from handtouch.cli import main
 from handtouch.config import shipped
@@ -17,13 +24,6 @@ from handtouch.hand.pads import mount_transform
 from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate import grasp as grasping
 from handtouch.simulate.contact_patch import ContactPatch
-from handtouch.simulate.grasp.event_score import (
-    EventScore,
-    compare_contacts,
-    ideal_contact_spans,
-    merge_spans,
-    touch_spans,
-)
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
 from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
@@ -169,7 +169,7 @@ def test_reported_contacts_on_a_ball_lie_within_their_covariance(ball: GraspReco
     along = np.einsum("kji,kj->ki", axes, error)[:, 1:]
     squared = (along**2 / values[:, 1:]).sum(1)[still]
     assert np.median(squared) < 3.0  # 1.39 for two dimensions of noise
-    assert np.median(np.linalg.norm(error, axis=1)) < 20e-6
+    assert np.median(np.linalg.norm(error, axis=1)) < 22e-6
     np.testing.assert_allclose(sum(served.error_m.values()), error, atol=1e-12)
     events = grasp_run.at_best(served, HAND.touch)
     assert events.touches >= 5

@@ -58,7 +58,7 @@ def test_known_errors_are_recovered() -> None:
     assert total.bias_m == pytest.approx(3e-5, rel=0.02)
     assert total.scatter_m == pytest.approx(1e-5, rel=0.05)
     assert total.rms_error_m == pytest.approx(np.hypot(3e-5, 1e-5), rel=0.02)
-    assert total.bound_ratio == pytest.approx(np.hypot(3, 1), rel=0.02)
+    assert total.rms_error_m / total.rms_bound_m == pytest.approx(np.hypot(3, 1), rel=0.02)
     assert total.rms_force_error_n == pytest.approx(0.25)
     assert (total.touches, total.missed, total.false_positives) == (1, 0, 0)
     assert total.max_error_m >= total.median_error_m > 0

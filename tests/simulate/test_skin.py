@@ -39,7 +39,7 @@ def skin_currents(deployment: config.Deployment, row: int, direction: Any) -> An
     """Return the currents of the skin on a pad, of a hand that rests in some direction of gravity."""
     turned = with_gravity(deployment, direction)
     hand = VirtualHand(turned, scenario(turned.pads[row][1].link), IDEAL)
-    return hand.virtual_pads[row].skin_currents(np.array([0.5]))[0]
+    return hand.virtual_pads[row].load_currents(np.array([0.5]))[0]
 
 
 def test_a_flat_skin_presses_by_its_weight_through_the_contact_law(deployment: config.Deployment) -> None:
@@ -81,7 +81,8 @@ def test_gravity_on_a_link_is_that_of_the_daemon_s_kinematics() -> None:
     turns = (BaseTurn(duration_s=4.0, axis=(1.0, 2.0, 0.0), rev_s=0.3),)
     in_base = gravity_in_base(turns, tuple(down.tolist()), 9.0)
     assert in_base is not None
-    expected = poses.direction_in_links(np.array(in_base))
+    rotations = [poses.pose_in_base(link).rotation for link in range(len(SHIPPED.pads))]
+    expected = np.array(in_base) @ np.array(rotations).reshape(-1, 3, 3)
     for row, (_, pad) in enumerate(SHIPPED.pads):
         motion = LinkMotion(robot.joint_chain(pad.link), robot.joint_chain("base"), Still(), turns, down)
         felt = motion.felt_m_s2(np.array([9.0]), np.zeros(3))[0]
@@ -123,7 +124,7 @@ def test_a_scenario_without_skin_has_no_weight_and_a_wrong_one_is_named(
     deployment: config.Deployment,
 ) -> None:
     light = scenario("flat").model_copy(update={"skin": None})
-    assert not VirtualHand(deployment, light, IDEAL).virtual_pads[0].skin_currents(np.array([1.0])).any()
+    assert not VirtualHand(deployment, light, IDEAL).virtual_pads[0].load_currents(np.array([1.0])).any()
     text = '[[touch]]\nlink = "a"\nfrom_s = 0.0\nduration_s = 1.0\npath = [[0.5, 0.5]]\nforce_n = [1.0]\n'
     with pytest.raises(ConfigError, match="g_per_cm2"):
         Scenario.parse(text + "[skin]\ng_per_cm2 = -1.0\n")

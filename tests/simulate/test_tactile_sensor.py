@@ -182,9 +182,7 @@ def test_a_live_sheet_creeps_as_one_whose_load_is_known_in_advance() -> None:
         key,
         lambda t: np.where(t >= begin_s, force_n, 0.0),
         np.zeros_like,
-        step_s,
-        step_s[1:],
-        none,
+        (step_s, step_s[1:], none),
         np.inf,
     )
     live = LiveSheets(law, np.array([key]), period_s)

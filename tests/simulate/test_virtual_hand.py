@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,9 +12,11 @@ from handtouch import config
 from handtouch.config import shipped
 from handtouch.field.contact_law import contact_stack_resistance
 from handtouch.hand import electrode_network, mount_transform, pad_network, pad_surface
+from handtouch.simulate.pad_circuit import PadCircuit
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
+from tests.sandwich import Sandwich
 from tests.simulate.surfaces import OUTLINE_TABLES, SURFACE_TABLES
 
 LINKS = ("flat", "round", "tapered", "tip")
@@ -228,3 +231,45 @@ def test_tolerances_shift_position_far_beyond_noise(deployment: config.Deploymen
     found = electrode_network(pad, deployment.sheets["s"]).estimate(counts * 10e-3 / 32767, 1e-6)
     off = np.linalg.norm(pad_surface(pad).point(found.x, found.y) - ideal.position_m)
     assert 2 * ideal.bound_m < off < 1e-3
+
+
+def test_both_sheets_of_a_pad_are_pressed_by_one_contact_and_obey_their_own_laws() -> None:
+    """Far from edges the total currents of both are those of the theory, for one force and radius."""
+    deployment = config.load(shipped.path("two_sheets.toml"))
+    hand = VirtualHand(deployment, press("thumb_tip", (0.5, 0.5), 1.0, 2.0), IDEAL)
+    pad, node = deployment.pads[0].pad, deployment.nodes["five_channel"]
+    counts = hand.all_counts(0, np.arange(1.0, 2.0, 0.01)).mean(axis=0)
+    assert len(counts) == 5
+    assert np.array_equal(hand.sample(1.0)[0], hand.all_counts(0, [1.0])[0])
+    totals_a = np.array([counts[:4].sum(), counts[4]]) * node.full_scale_ma * 1e-3 / 32767
+    network = pad_network(pad, deployment.sheets[pad.sheet])
+    spreading_m = float(network.spreading_radius(network.a / 2, network.b / 2)) * 30e-3 / network.a
+    sheets = [deployment.sheets[name] for name in ("steep", "even")]
+    sandwich = Sandwich(
+        (1e-6 * sheets[0].contact_ohm_mm2, 1e-6 * sheets[1].contact_ohm_mm2),
+        (sheets[0].alpha, sheets[1].alpha),
+        (sheets[0].ohm_per_square, sheets[1].ohm_per_square),
+    )
+    assert totals_a == pytest.approx(sandwich.currents(1.0, 2e-3, node.drive_v, spreading_m), rel=0.02)
+
+
+def test_the_sheets_of_a_pad_differ_in_parts_and_behaviour() -> None:
+    deployment = WORLDS["default"].draw(3).describe(config.load(shipped.path("two_sheets.toml")))
+    hand = VirtualHand(deployment, press("thumb_tip"), WORLDS["default"].draw(3))
+    first, second = hand.virtual_pads[0], hand.virtual_pads[2]
+    assert second.is_total
+    assert not first.is_total
+    assert isinstance(first.circuit, PadCircuit)
+    assert isinstance(second.circuit, PadCircuit)
+    assert second.circuit.gaps != first.circuit.gaps
+    assert second.sheet.ohm_per_square / 600.0 != first.sheet.ohm_per_square / 2400.0
+    assert second.history is not first.history
+    assert len(second.limits) == 1
+
+
+def test_samples_of_both_sheets_equal_their_counts_with_errors_of_channels() -> None:
+    deployment = config.load(shipped.path("two_sheets.toml"))
+    world = dataclasses.replace(WORLDS["ideal"], electronics=WORLDS["harsh"].electronics).draw(5)
+    hand = VirtualHand(deployment, press("thumb_tip", (0.4, 0.5), 3.0), world)
+    for t_s in np.arange(1.0, 4.0, 0.3):
+        assert np.array_equal(hand.sample(t_s)[0], hand.all_counts(0, [t_s])[0])

@@ -77,14 +77,14 @@ def test_held_force_reads_as_in_sheet_model(
 ) -> None:
     scenario = presses((1.0, 3.0, 2.0), (6.0, 30.0, 1.0), (37.0, 5.0, 3.0))
     pad = built(deployment, scenario, drawn(calm(kind)))
-    track = SheetHistory(
-        dataclasses.replace(model, fluctuation=Fluctuation()),
-        1,
-        lambda t: [sum(touch.force_at(t) for touch in scenario.touches)],
-        step_s=1e-3,
-    )
+
+    def force_n(t_s: float) -> float:
+        return sum(touch.force_at(t_s) for touch in scenario.touches)
+
+    calm_model = dataclasses.replace(model, fluctuation=Fluctuation())
+    track = SheetHistory(calm_model, 1, lambda t_s: [force_n(t_s)], step_s=1e-3)
     times = np.concatenate([np.arange(1.2, 4, 0.3), np.arange(6.3, 35.5, 1.3), np.arange(37.2, 41.8, 0.4)])
-    expected = [track.load_ratio(t)[0] for t in times]
+    expected = [track.apparent_n(t)[0] / force_n(t) for t in times]
     np.testing.assert_allclose(pad.force_ratio(times), expected, atol=0.015)
 
 
@@ -156,6 +156,17 @@ def test_zeros_drift_independently_and_temperature_is_common() -> None:
     assert np.linalg.matrix_rank(zeros, tol=1e-6 * np.abs(zeros).max()) == 1
     one, other = (ElectronicsDrift(warm, [("right", link)]) for link in ("flat", "tip"))
     np.testing.assert_array_equal(one.temperature_rise_k(times), other.temperature_rise_k(times))
+
+
+def test_zeros_begin_where_they_are_drawn_and_move_while_the_hand_warms_up() -> None:
+    cold = ElectronicsSpread(
+        zero_counts=Fixed(40.0), warm_up_k=Fixed(10.0), offset_counts_per_k=Normal(0.0, 5.0)
+    )
+    of = World("cold", electronics=cold).draw(3)
+    drift = ElectronicsDrift(of, [("right", "flat")])
+    slope = of.offset_counts_per_k("right/flat")
+    zeros = drift.zero_counts(np.array([0.0, 60.0, 120.0, 500.0]))[:, 0]
+    np.testing.assert_allclose(zeros, 40.0 + np.outer([0.0, 5.0, 10.0, 10.0], slope), rtol=1e-12)
 
 
 def test_noise_is_normal_and_white() -> None:

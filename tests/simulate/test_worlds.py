@@ -33,6 +33,7 @@ from handtouch.simulate.worlds import (
     Uniform,
     World,
 )
+from handtouch.simulate.worlds.response_spread import HiddenResponse
 from tests.deployments import SHEET_TOLERANCES
 
 SEEDS = 400
@@ -85,6 +86,10 @@ def shear_value(name: str) -> Draw:
     return lambda drawn, _: getattr(shear_parts(drawn.world.name, drawn.seed), name)
 
 
+def response_value(name: str) -> Draw:
+    return lambda drawn, _: getattr(drawn.response("left/pad", 4), name)
+
+
 CHANNEL_ERRORS = ("common_noise_counts", "hum_counts", "crosstalk", "nonlinearity_counts")
 
 
@@ -122,12 +127,15 @@ DRAWS: dict[str, Draw] = {
     "sheets.parameter_ratio": lambda drawn, _: drawn.sheet_factors("right/round"),
     "electronics.noise_ratio": pad_value("noise_ratio"),
     **{f"electronics.{name}": channel_value(name) for name in CHANNEL_ERRORS},
+    "electronics.zero_counts": lambda drawn, _: drawn.zero_counts("right/round"),
+    "electronics.warm_up_k": hand_rate("warm_up_k"),
     "electronics.zero_drift_counts_per_s": hand_rate("zero_drift_counts_per_s"),
     "electronics.temperature_drift_k_per_s": hand_rate("temperature_drift_k_per_s"),
     "electronics.offset_counts_per_k": pad_value("offset_counts_per_k"),
     "electronics.gain_per_k": pad_value("gain_per_k"),
     "electronics.supply_drift_per_s": hand_rate("supply_drift_per_s"),
     **{f"shear.{entry.name}": shear_value(entry.name) for entry in dataclasses.fields(ShearSpread)},
+    **{f"responses.{entry.name}": response_value(entry.name) for entry in dataclasses.fields(HiddenResponse)},
 }
 
 
@@ -138,7 +146,7 @@ def distributions(world: World) -> dict[str, Distribution]:
         if group.name != "name":
             spread = getattr(world, group.name)
             for entry in dataclasses.fields(spread):
-                if not entry.name.endswith("_kinds"):
+                if not entry.name.endswith(("_kinds", "kind")):
                     found[f"{group.name}.{entry.name}"] = getattr(spread, entry.name)
     return found
 

@@ -163,7 +163,7 @@ def bare_rate() -> int:
 def test_flood_of_unused_identifiers_costs_no_sample_and_is_counted_to_the_frame(
     host_starter: Starter,
 ) -> None:
-    rate = bare_rate()
+    rate = next(filter(None, (bare_rate() for _ in range(5))), 0)  # the guest may have had no processor
     assert rate >= RATES[0]
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         hand = Hand(Path(folder), host_starter)

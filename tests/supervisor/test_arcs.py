@@ -15,6 +15,7 @@ from handtouch.supervisor.diagnose.hand_diagnostics import HandDiagnostics
 from handtouch.supervisor.diagnose.model import DiagnosisModel, HandSamples
 from handtouch.wire.faults import FaultKind
 from tests.deployments import SIX_ARCS, THREE_ARCS, arcs_text
+from tests.exact_pads import electrodes_of
 
 Counts = NDArray[np.float64]
 SIDES, DISC = 0, 1
@@ -57,7 +58,7 @@ def test_ordinary_presses_of_either_pad_give_no_diagnosis() -> None:
 
 
 def test_a_dead_electrode_among_six_is_named_and_left_out() -> None:
-    floating = model().networks[DISC].with_series_ohm([np.inf if k == 3 else 0.0 for k in range(6)])
+    floating = electrodes_of(model())[DISC].with_series_ohm([np.inf if k == 3 else 0.0 for k in range(6)])
     diagnostics, found = diagnose(DISC, network=floating)
     assert found == [(DISC, FaultKind.DEAD_ELECTRODE, ("d",))]
     assert diagnostics.dead_electrodes() == {DISC: 3}

@@ -28,6 +28,7 @@ from handtouch.supervisor.diagnose.descriptions import describe_contact_fault, d
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables
 from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS, StaticLoad
 from handtouch.wire.faults import FaultKind
+from tests.exact_pads import electrodes_of
 
 PAD, SECOND = 13, 1_000_000_000
 LINK = "palm_thumb"
@@ -97,7 +98,7 @@ def simulate(
 @lru_cache(maxsize=4096)
 def fractions(x: float, y: float, series_ohm: tuple[float, ...] = (0.0,) * 4) -> Counts:
     """Return the shares of the electrodes; kept, as a contact has them for many samples."""
-    network = model().networks[0].with_series_ohm(series_ohm)
+    network = electrodes_of(model())[0].with_series_ohm(series_ohm)
     return np.asarray(network.fractions(x * network.a, y * network.b))
 
 
@@ -141,7 +142,7 @@ def test_offset_names_its_channel_also_while_the_pad_is_held() -> None:
 
 def detector(series_ohm: float = 0.0) -> ContactFaultDetector:
     """Detector of the first pad, with the tolerances that its deployment states."""
-    made, network = model(), model().networks[0].with_series_ohm([series_ohm] * 4)
+    made, network = model(), electrodes_of(model())[0].with_series_ohm([series_ohm] * 4)
     if network not in _TABLES:
         networks = (part for part in made.parts[0]() if isinstance(part, ElectrodeNetwork))
         parts = [part.with_series_ohm([series_ohm] * 4) for part in networks]
@@ -183,7 +184,7 @@ def test_gain_step_ends_when_contacts_contradict_it() -> None:
 
 def test_strokes_along_the_centre_line_are_no_evidence_of_shorted_electrodes() -> None:
     """Both electrodes read the same there, shorted or not."""
-    pad, network = detector(500.0), model().networks[0].with_series_ohm([500.0] * 4)
+    pad, network = detector(500.0), electrodes_of(model())[0].with_series_ohm([500.0] * 4)
     for number in range(60):
         y = np.random.default_rng(number).uniform(0.06, 0.94)
         counts = 3000 * network.fractions(0.5 * network.a, y * network.b)
@@ -303,9 +304,25 @@ def test_short_to_the_layer_is_distinguished_from_a_saturated_channel_of_the_sam
 
 
 def test_still_contact_is_no_gum_while_nothing_else_happens() -> None:
-    """A robot that rests a finger on a table gives the same currents."""
+    """A robot that rests a finger on a table gives the same currents: only the probability is reported."""
     _, changes = play(lambda t, _: fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0), 120)
-    assert changes == []
+    assert {change.kind for change in changes} == {FaultKind.STATIC_LOAD}
+    first, *later = [change.published for change in changes]
+    assert f"probably gum ({first.confidence:.0%})" in first.cause
+    assert 0.5 < first.confidence < 0.99
+    assert all(one.confidence > first.confidence + 0.1 for one in later)
+    assert (first.position_valid, first.force_valid) == (True, True)
+    assert not any(change.is_fault for change in changes)
+
+
+def test_a_static_load_becomes_gum_once_presses_beside_it_leave_it_as_it_was() -> None:
+    def contacts(t: float, _: np.random.Generator) -> Counts:
+        gum = fractions(0.3, 0.6) * (600.0 if t > 5 else 0.0)
+        return np.asarray(gum + (presses(t) if t > 90 else 0.0))
+
+    diagnosis, changes = play(contacts, 120)
+    assert [found.kind for found in diagnosis.diagnoses()] == [FaultKind.GUM]
+    assert {change.kind for change in changes} == {FaultKind.STATIC_LOAD, FaultKind.GUM}
 
 
 def test_static_contact_with_tremor_is_a_held_object() -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.calibration.auto_calibration import CalibrationState
+from handtouch.calibration.calibration import CalibrationState
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,

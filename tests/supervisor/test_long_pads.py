@@ -18,6 +18,7 @@ from handtouch.supervisor.diagnose import DiagnosisModel
 from handtouch.supervisor.diagnose.contact_faults import ContactFaultDetector
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, HypothesisTables
 from handtouch.wire.faults import FaultKind
+from tests.exact_pads import electrodes_of
 
 Floats = NDArray[np.float64]
 SIDES = ("x0", "xa", "y0", "yb")
@@ -32,7 +33,7 @@ def long_pad() -> tuple[ElectrodeNetwork, HypothesisTables, Floats]:
     pads = tuple(pad.model_copy(update={"surface": plane}) for pad in hand.pads)
     changed = whole.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
     model = DiagnosisModel.from_deployment(changed, "right")
-    network = model.networks[13]
+    network = electrodes_of(model)[13]
     tables = HypothesisTables(network, model.surfaces[13], model.parts[13](), model.electrodes[13])
     return network, tables, model.gain_covariance[13]
 

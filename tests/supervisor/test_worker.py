@@ -275,7 +275,8 @@ def test_measured_law_ends_quarantine_of_a_pad_without_observable_gains(bench: B
     (applied,) = calibrations(messages, 2)
     assert applied.law is not None
     assert applied.law.alpha == 1.4
-    assert np.diag(np.reshape(applied.covariance or (), (4, 4))) == pytest.approx([0.05**2 * 0.75] * 4)
+    (stated,) = {node.gain_std for node in bench.deployment.nodes.values()}
+    assert np.diag(np.reshape(applied.covariance or (), (4, 4))) == pytest.approx([stated**2 * 0.75] * 4)
     assert assessment(messages, 2).calibration_state == "calibrated"
 
 

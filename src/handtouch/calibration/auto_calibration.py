@@ -1,6 +1,6 @@
 """Automatic calibration of the node of one pad by ordinary contacts.
 
-Public: `AutoCalibrator`, `CalibrationState`, `GainUpdate`, `new_gain_estimator`. A node that replaced another
+Public: `AutoCalibrator`, `GainUpdate`, `new_gain_estimator`. A node that replaced another
 is in quarantine until it has a calibration of its own: from the store, from contacts, or from an operator. No
 clock; time is an argument.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from handtouch.calibration.calibration import (
     MAX_GAIN,
     MIN_GAIN,
+    CalibrationState,
     Gains,
     LearnedParts,
     channel_values,
@@ -26,11 +26,14 @@ from handtouch.calibration.calibration import (
 from handtouch.calibration.gains import (
     BATCH_CONTACTS,
     MAX_SHAPE_DEVIATION,
+    NO_PARTS,
     GainEstimator,
     GainStatus,
+    PartModels,
 )
+from handtouch.calibration.sheet_test import SheetTest
 from handtouch.calibration.stationary_contacts import StationaryContact
-from handtouch.field.model import ForwardModel, FractionModel
+from handtouch.field.model import ForwardModel
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 
@@ -52,19 +55,6 @@ in 1 of 10^6 pads."""
 _MANUAL_REMEDY = "measure them with `handtouch calibrate`"
 
 
-class CalibrationState(StrEnum):
-    """State of a node's calibration, as `health` publishes it."""
-
-    DEFAULT = "default"
-    """deployment file only, and no contradiction to it"""
-    CALIBRATED = "calibrated"
-    """own calibration active"""
-    QUARANTINED = "quarantined"
-    """replaced or changed, without a calibration of its own yet"""
-    MANUAL_REQUIRED = "manual_required"
-    """the same, and contacts can't calibrate it"""
-
-
 @dataclass(frozen=True)
 class GainUpdate:
     """Consequence of contacts: apply the gains; store them, too."""
@@ -77,44 +67,41 @@ def new_gain_estimator(
     model: ForwardModel,
     attempt: int = 0,
     own: Gains | None = None,
-    parts: Sequence[FractionModel] = (),
-    part_limits: Sequence[float] = (),
+    parts: PartModels = NO_PARTS,
+    gain_std: float | None = None,
 ) -> GainEstimator:
     """Return the estimator of a pad's gains, about gains of its `own` or the deployment's.
 
-    `parts`, `part_limits`: see `GainEstimator`.
     `attempt`: 0, then 1, with a wider prior, where no gains near these explain the contacts.
     """
     return GainEstimator(
         model,
         tolerance=_INITIAL_LOG_GAIN_STDS[attempt],
-        model_error=_MODEL_ERROR if parts else _MODEL_ERROR_WITHOUT_PARTS,
+        model_error=_MODEL_ERROR if parts.models else _MODEL_ERROR_WITHOUT_PARTS,
         required_std=_MAX_CALIBRATED_LOG_GAIN_STD,
-        start=own.factors if own else None,
-        covariance=own.covariance if own else None,
-        part_offsets=own.parts.offsets if own and own.parts else None,
-        joint_covariance=own.parts.covariance if own and own.parts else None,
+        gain_std=gain_std if attempt == 0 else None,
+        known=own,
         parts=parts,
-        part_limits=part_limits if parts else 1.0,
     )
 
 
 class AutoCalibrator:
     """Calibration state and gain estimate of the node at one pad.
 
-    model: the pad's. parts: models in each of which one of its parts differs by one standard deviation, and
-    these, part_stds; part_limits: how many times that much they may differ by.
+    model: the pad's. parts: those that differ from pad to pad; part_stds: their standard deviations.
+    gain_std: of the logarithm of a gain, as stated.
     """
 
     def __init__(
         self,
         model: ForwardModel,
-        parts: Sequence[FractionModel] = (),
+        parts: PartModels = NO_PARTS,
         part_stds: Sequence[float] = (),
-        part_limits: Sequence[float] | None = None,
+        gain_std: float | None = None,
     ) -> None:
         self._model, self._parts, self.part_stds = model, parts, tuple(part_stds)
-        self._part_limits = tuple(part_limits or (1.0,) * len(parts))
+        self._gain_std = gain_std
+        self._part_limits = np.broadcast_to(np.asarray(parts.limits, np.float64), len(parts.models))
         self.serial: int | None = None
         self.calibration_state = CalibrationState.DEFAULT
         self.can_learn = False
@@ -125,7 +112,8 @@ class AutoCalibrator:
         self.since_ns, self._attempt, self._store_at_contacts = 0, 0, 0
         self._has_own_gains = False  # the estimate started from gains of its own
         self._mean_gain = 1.0  # geometric mean, not observable by contacts
-        self._estimator = new_gain_estimator(model, parts=parts, part_limits=self._part_limits)
+        self._sheet_test: SheetTest | None = None
+        self._estimator = new_gain_estimator(model, parts=parts, gain_std=gain_std)
         self.estimate = self._estimator.estimate
 
     def assign_node(
@@ -182,14 +170,47 @@ class AutoCalibrator:
         contacts, self._pending = self._pending, []
         before = self.estimate.contacts
         currents = np.transpose([one.currents for one in contacts])
-        self._estimator.add_contacts(
-            currents, np.transpose([one.noise for one in contacts]), contact.last_sync_ns
-        )
+        noise = np.transpose([one.noise for one in contacts])
+        if (
+            self._sheet_test is None
+            and self.calibration_state is CalibrationState.CALIBRATED
+            and self.part_stds
+        ):
+            self._sheet_test = SheetTest(self.gains, self._new_estimator)
+        self._estimator.add_contacts(currents, noise, contact.last_sync_ns)
         self.estimate = self._estimator.estimate
+        if self._test_sheet(currents, noise, contact.last_sync_ns):
+            return GainUpdate(apply=True)
         if self.estimate.contacts == before:
             return GainUpdate()
         self._check_gain_limits()
         return self._assess_estimate(contact.last_sync_ns)
+
+    def _test_sheet(self, currents: FloatArray, noise: FloatArray, now_ns: int) -> bool:
+        """Test whether contacts (c, n) are on the calibrated sheet; return whether that has changed.
+
+        While they aren't, the estimate is that of another sheet on the same node.
+        """
+        if self._sheet_test is None:
+            return False
+        test, before = self._sheet_test, self._sheet_test.is_replaced
+        estimator = test.add_contacts(currents, noise, now_ns)
+        if test.is_replaced and not before:
+            self._estimator = estimator
+        elif before and not test.is_replaced:
+            self._restart_estimator(0, test.known)
+        elif test.is_finished:
+            self._sheet_test = None
+        self.estimate = self._estimator.estimate
+        return before != test.is_replaced
+
+    def _new_estimator(self, own: Gains) -> GainEstimator:
+        return new_gain_estimator(self._model, 0, own, self._parts, self._gain_std)
+
+    @property
+    def sheet_replaced(self) -> bool:
+        """Return whether contacts are on another sheet than the calibrated one, probably."""
+        return self._sheet_test is not None and self._sheet_test.is_replaced
 
     @property
     def force_unreliable(self) -> bool:
@@ -224,7 +245,7 @@ class AutoCalibrator:
     @property
     def _found_leads(self) -> str:
         """Resistances of leads beyond what the deployment states, as text; empty where they are as stated."""
-        found, leads = self.estimate, np.flatnonzero(np.array(self._part_limits) > 1)
+        found, leads = self.estimate, np.flatnonzero(self._part_limits > 1)
         if found.status is not GainStatus.ESTIMATED or found.widening < _MIN_REPORTED_WIDENING:
             return ""
         stds = np.array(self.part_stds)[leads]
@@ -238,7 +259,9 @@ class AutoCalibrator:
 
     @property
     def diagnoses(self) -> tuple[Diagnosis, ...]:
-        """Return the diagnosis of a node in quarantine: cause and remedy."""
+        """Return the diagnosis of a node in quarantine, or of a new sheet: cause and remedy."""
+        if self._sheet_test is not None and self._sheet_test.is_replaced:
+            return (self._sheet_test.diagnosis,)
         if not self.force_unreliable:
             return ()
         kind, cause = self._quarantine_cause
@@ -277,13 +300,13 @@ class AutoCalibrator:
         if status is GainStatus.INVALID:
             return self._reject_gains(now_ns)
         if status is GainStatus.UNDETERMINED:
-            return GainUpdate(apply=self.force_unreliable)
+            return GainUpdate(apply=self.force_unreliable or self.sheet_replaced)
         newly_calibrated = self.calibration_state is not CalibrationState.CALIBRATED
         if not newly_calibrated and self.estimate.contacts < self._store_at_contacts:
             return GainUpdate()
         self._store_at_contacts = 2 * self.estimate.contacts
         self.calibration_state = CalibrationState.CALIBRATED
-        return GainUpdate(apply=True, store=True)
+        return GainUpdate(apply=True, store=not self.sheet_replaced)
 
     def _reject_gains(self, now_ns: int) -> GainUpdate:
         """Restart, or enter quarantine, as no gains near these explain the contacts."""
@@ -309,6 +332,7 @@ class AutoCalibrator:
     def _restart_estimator(self, attempt: int, own: Gains | None = None) -> None:
         self._attempt, self._pending, self._has_own_gains = attempt, [], own is not None
         self._mean_gain = math.exp(np.log(own.factors).mean()) if own else 1.0
-        self._estimator = new_gain_estimator(self._model, attempt, own, self._parts, self._part_limits)
+        self._sheet_test = None
+        self._estimator = new_gain_estimator(self._model, attempt, own, self._parts, self._gain_std)
         self.estimate = self._estimator.estimate
         self._store_at_contacts = _MIN_CONTACTS_TO_STORE_AGAIN

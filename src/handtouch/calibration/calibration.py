@@ -1,9 +1,9 @@
 """Calibration of one node beyond the deployment file, and its provenance; to JSON and back.
 
 Public: `Calibration` of `Gains` (with `LearnedParts`), `Offsets`, `LawParameters` and `StoredSheetState`;
-`Provenance`;
-`CalibrationVersion`, one entry of the store; `check_match`, which binds a version to a node, `MismatchError`;
-`differences`; `aged_gains`; `channel_values` and `matrix`, which convert arrays.
+`Provenance`; `CalibrationState`; `CalibrationVersion`, one entry of the store; `check_match`, which binds a
+version to a node, `MismatchError`; `differences`; `aged_gains`, `drifted_gains`; `channel_values`
+and `matrix`, which convert arrays.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
+from enum import StrEnum
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-MIN_CHANNELS, MAX_CHANNELS = 3, 16
-"""Number of channels of a node."""
+from handtouch.config.base import CHANNEL_RANGE, MAX_CHANNELS, MIN_CHANNELS
+
 ChannelValues = Annotated[tuple[float, ...], Field(min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)]
 Matrix = tuple[tuple[float, ...], ...]
 Positive = Annotated[float, Field(gt=0)]
@@ -60,6 +62,19 @@ def _check_covariance(values: Matrix) -> Matrix:
 
 Covariance3 = Annotated[Matrix, Field(min_length=3, max_length=3), AfterValidator(_check_covariance)]
 Covariance = Annotated[Matrix, AfterValidator(_check_covariance)]
+
+
+class CalibrationState(StrEnum):
+    """State of a node's calibration, as `health` publishes it."""
+
+    DEFAULT = "default"
+    """deployment file only, and no contradiction to it"""
+    CALIBRATED = "calibrated"
+    """own calibration active"""
+    QUARANTINED = "quarantined"
+    """replaced or changed, without a calibration of its own yet"""
+    MANUAL_REQUIRED = "manual_required"
+    """the same, and contacts can't calibrate it"""
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -145,12 +160,13 @@ class StoredSheetState:
 
 @dataclass(frozen=True, config=_RECORD)
 class Calibration:
-    """Calibration of one node; None for parts that are unknown."""
+    """Calibration of one node; None for parts that are unknown. second_law: of the pad's second sheet."""
 
     gains: Gains | None = None
     offsets: Offsets | None = None
     law: LawParameters | None = None
     sheet: StoredSheetState | None = None
+    second_law: LawParameters | None = None
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -183,6 +199,10 @@ class CalibrationVersion:
     written_utc: str
     provenance: Provenance
     calibration: Calibration
+
+    def is_own(self, config: str) -> bool:
+        """Return True if the values are this node's, under the pad's tables of this hash."""
+        return self.config == config and not self.provenance.foreign
 
     @property
     def calibration_id(self) -> str:
@@ -259,26 +279,30 @@ def aged_gains(
     gains = version.calibration.gains
     if gains is None:
         return None
-    drift = _LOG_GAIN_STD_PER_DAY**2 * age_s(version, now) / 86400
-    if version.provenance.foreign:
-        drift += _NODE_TO_NODE_LOG_GAIN_STD**2
+    foreign = bool(version.provenance.foreign)
+    if foreign or gains.parts is None or gains.parts.stated_stds != stated_stds:
+        gains = replace(gains, parts=None)
+    return drifted_gains(gains, age_s(version, now), _NODE_TO_NODE_LOG_GAIN_STD if foreign else 0.0)
+
+
+def drifted_gains(gains: Gains, elapsed_s: float, log_gain_std: float = 0.0) -> Gains:
+    """Return gains with the uncertainty of their drift in a time, and of `log_gain_std` besides."""
+    drift = _LOG_GAIN_STD_PER_DAY**2 * elapsed_s / 86400 + log_gain_std**2
     # a random walk of gains that leaves their product unchanged
     count = len(gains.factors)
-    walk, covariance, parts = drift * (np.eye(count) - 1 / count), np.array(gains.covariance), None
-    if gains.parts is not None and not version.provenance.foreign and gains.parts.stated_stds == stated_stds:
-        joint = np.array(gains.parts.covariance)
+    walk, parts = drift * (np.eye(count) - 1 / count), gains.parts
+    if parts is not None:
+        joint = np.array(parts.covariance)
         joint[:count, :count] += walk
-        parts = LearnedParts(
-            gains.parts.stated_stds, gains.parts.offsets, matrix(joint), gains.parts.touch_error
-        )
-    return Gains(gains.factors, matrix(covariance + walk), parts)
+        parts = replace(parts, covariance=matrix(joint))
+    return Gains(gains.factors, matrix(np.array(gains.covariance) + walk), parts)
 
 
 def channel_values(values: ArrayLike) -> ChannelValues:
     """Return numbers of all channels as a tuple. Raises ValueError for another shape."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 1 or not MIN_CHANNELS <= len(array) <= MAX_CHANNELS:
-        raise ValueError(f"values has shape {array.shape}: must be one for each of 3 to 16 channels")
+        raise ValueError(f"values has shape {array.shape}: must be one for each of {CHANNEL_RANGE} channels")
     return tuple(array.tolist())
 
 
@@ -295,10 +319,12 @@ def differences(
 ) -> list[tuple[str, Sequence[float] | str | None, Any]]:
     """Return what differs as (name, before, after), without covariances."""
     rows: list[tuple[str, Any, Any]] = []
+    of_law = ("contact_ohm_mm2", "alpha", "ohm_per_square", "hertz_force_n")
     for part, names in (
         ("gains", ("factors",)),
         ("offsets", ("counts", "variance", "noise")),
-        ("law", ("contact_ohm_mm2", "alpha", "ohm_per_square", "hertz_force_n")),
+        ("law", of_law),
+        ("second_law", of_law),
         ("sheet", ("kind", "version", "data")),
     ):
         one, other = getattr(before, part), getattr(after, part)

@@ -13,10 +13,9 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-import handtouch
 from handtouch.calibration.calibration import CalibrationVersion, MismatchError, Provenance, check_match
 from handtouch.calibration.store import Store, StoreError
-from handtouch.host.user import user_name
+from handtouch.host.user import program_name
 
 _FORMAT, _FORMAT_VERSION = "handtouch-calibrations", 1
 
@@ -110,5 +109,4 @@ def _link_names(version: CalibrationVersion) -> tuple[str, str]:
 
 
 def _local_provenance(note: str) -> Provenance:
-    program = f"{user_name()}, handtouch {handtouch.__version__}"
-    return Provenance("", host=platform.node(), program=program, note=note)
+    return Provenance("", host=platform.node(), program=program_name(), note=note)

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.calibration.calibration import Gains
 from handtouch.calibration.contact_scores import (
     UNKNOWNS,
     ContactScores,
@@ -57,6 +58,7 @@ _CELLS_PER_SIDE = 10  # a side
 _MEMORY_CONTACTS = 128.0  # contacts over which the share of points is estimated
 _MIN_OUTLIER_VARIANCE = 25.0  # variance of the scores of contacts that are no points, at least
 _MIN_INFORMATION_FRACTION = 0.2  # part of a batch's information that counts, however unlikely its contacts
+_MIN_GAIN_STD = 1e-4  # as good as exact
 _PART_RATIOS = 12  # of deviations of parts to stated ones that are tried
 _MEDIAN_SQUARED_SCORE = 0.4549  # median of the square of a standard normal number
 _DAY_NS = 86_400e9
@@ -107,6 +109,20 @@ class GainEstimate:
         return float(np.sqrt(np.diag(self.covariance).max()))
 
 
+class PartModels(NamedTuple):
+    """Parts (p,) of a pad that differ from pad to pad, such as a gap."""
+
+    models: Sequence[FractionModel] = ()
+    """in each of which one part differs by one standard deviation; the pad's own for one without a
+    tolerance"""
+    limits: ArrayLike = 1.0
+    """(p,) how many times that deviation a part may have at most, if contacts show that such parts have more
+    than stated; stored parts were found so before"""
+
+
+NO_PARTS = PartModels()
+
+
 class GainEstimator:
     """Running estimate of the gains of one pad; its state has a fixed size.
 
@@ -117,12 +133,10 @@ class GainEstimator:
         the pad, so a cell never adds more information than this allows, however often it is touched.
     required_std: of the least certain log gain, at which the gains count as estimated; for other parts as
         stated, as no number of contacts separates them from gains.
-    start: initial gains (c,), their covariance (c, c) of logarithms as `covariance`, both as stored; with the
-        `part_offsets` (p,) and the `joint_covariance` (c + p, c + p), if these were stored.
-    parts: models in each of which one part, such as a gap, differs by one standard deviation; `model` itself
-        for those without a tolerance.
-    part_limits: (p,) how many times that deviation a part may have at most, if contacts show that such parts
-        have more than stated; 1 by default. Stored parts were found so before.
+    gain_std: standard deviation of a log gain as stated, which counts unless contacts show that gains have
+        more, up to the tolerance; None: nothing is stated.
+    known: gains and parts found before.
+    parts: those that differ from pad to pad.
 
     Raises ValueError for a parameter out of range.
     """
@@ -135,12 +149,9 @@ class GainEstimator:
         drift_per_day: float = 1e-3,
         model_error: float = 5e-4,
         required_std: float = 5e-3,
-        start: ArrayLike | None = None,
-        covariance: ArrayLike | None = None,
-        part_offsets: ArrayLike | None = None,
-        joint_covariance: ArrayLike | None = None,
-        parts: Sequence[FractionModel] = (),
-        part_limits: ArrayLike = 1.0,
+        gain_std: float | None = None,
+        known: Gains | None = None,
+        parts: PartModels = NO_PARTS,
     ) -> None:
         for name, value, least in (
             ("tolerance", tolerance, 1e-9),
@@ -154,25 +165,30 @@ class GainEstimator:
         self._model, self._channels = model, channel_count(model)
         self._drift_per_day, self._model_error, self._required_std = drift_per_day, model_error, required_std
         self._log_gains = np.zeros(self._channels)
-        if start is not None:
-            self._log_gains = _normalised_logs(start, self._channels)
-        self._parts, self._part_offsets = tuple(parts), np.zeros(len(parts))
+        learned = None if known is None else known.parts
+        if known is not None:
+            self._log_gains = _normalised_logs(known.factors, self._channels)
+        self._parts, self._part_offsets = tuple(parts.models), np.zeros(len(parts.models))
         free, self._gain_basis = self._channels - 1, gain_basis(self._channels)
-        limits = np.asarray(part_limits if joint_covariance is None else 1.0, dtype=np.float64)
-        self._part_limits: FloatArray = np.broadcast_to(limits, len(parts))
-        self._information: FloatArray = np.diag([tolerance**-2] * free + (self._part_limits**-2.0).tolist())
-        self._basis = np.eye(self._channels + len(parts))[:, 1:]
+        limits = np.asarray(parts.limits if learned is None else 1.0, dtype=np.float64)
+        least = tolerance if gain_std is None else min(max(gain_std, _MIN_GAIN_STD), tolerance)
+        self._stated: FloatArray = np.concatenate([np.full(free, least), np.ones(len(self._parts))])
+        self._widest = np.concatenate([np.full(free, tolerance), np.broadcast_to(limits, len(self._parts))])
+        """(p,) standard deviations before any contact: as stated, and those of the present information"""
+        self._information: FloatArray = np.diag(self._widest**-2.0)
+        self._basis = np.eye(self._channels + len(self._parts))[:, 1:]
         self._basis[: self._channels, :free] = self._gain_basis
-        if joint_covariance is not None and part_offsets is not None:
-            self._part_offsets = np.array(part_offsets, dtype=np.float64)
-            known = self._basis.T @ np.asarray(joint_covariance, dtype=np.float64) @ self._basis
-            self._information = _inverse(known + 1e-18 * np.eye(len(known)))
-        elif covariance is not None:
-            known = self._gain_basis.T @ np.asarray(covariance, dtype=np.float64) @ self._gain_basis
-            self._information[:free, :free] = _inverse(known + 1e-18 * np.eye(free))
+        if known is not None:  # nothing is stated of these gains
+            self._stated = self._widest.copy()
+        if learned is not None:
+            self._part_offsets = np.array(learned.offsets, dtype=np.float64)
+            self._information = _information(learned.covariance, self._basis)
+        elif known is not None:
+            self._information[:free, :free] = _information(known.covariance, self._gain_basis)
+        self._prior = self._information, self._values
         # the positions behind given gains are unknown: each cell starts with half of the information it can
         # add
-        already = 0.0 if covariance is None or model_error == 0 else model_error**-2
+        already = 0.0 if known is None or model_error == 0 else model_error**-2
         scores = max(self._channels - UNKNOWNS, 0)
         self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE, scores), already)
         self._mixture = _OutlierMixture()
@@ -217,14 +233,11 @@ class GainEstimator:
     @property
     def estimate(self) -> GainEstimate:
         """Return the estimate after the batches so far."""
-        squares, counted = self._misfit_sums
-        misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
-        # scores wider than by noise: model errors of the points widen the covariance of the gains too
-        widening = max(1.0, np.nan_to_num(misfit) ** 2)
-        ratio = self._part_widening(widening)
-        information, log_gains, part_offsets = self._with_parts_as_wide(ratio)
-        joint = self._basis @ _inverse(information) @ self._basis.T
-        joint *= widening
+        misfit, widening = self._misfit
+        stds, part_widening = self._most_likely_priors(widening)
+        information, log_gains, part_offsets = self._with_priors(stds)
+        prior = np.diag(stds**-2.0)  # which misfit doesn't widen
+        joint = self._basis @ _inverse((information - prior) / widening + prior) @ self._basis.T
         basis, free = self._gain_basis, self._channels - 1
         with_parts_as_stated = basis @ _inverse(self._information[:free, :free]) @ basis.T * widening
         status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
@@ -233,7 +246,7 @@ class GainEstimator:
             joint[: self._channels, : self._channels],
             part_offsets,
             joint,
-            ratio,
+            part_widening,
             math.sqrt(self._touch_variance),
             self._contacts,
             self._effective_contacts,
@@ -243,36 +256,75 @@ class GainEstimator:
             reason,
         )
 
-    def _part_widening(self, score_variance: float) -> float:
-        """Return the most likely deviation of the parts that may be wider than stated, over that, from 1 on.
+    @property
+    def _values(self) -> FloatArray:
+        """Log gains along the basis, then the parts' offsets (p,)."""
+        return np.concatenate([self._gain_basis.T @ self._log_gains, self._part_offsets])
 
-        The contacts' information about these parts alone is that of the estimate less that of its prior.
+    @property
+    def _misfit(self) -> tuple[float, float]:
+        """Root mean square of the scores, NaN without any, and the variance that it adds: scores wider than
+        by noise show model errors of the points, which widen the covariance of the gains, too."""
+        squares, counted = self._misfit_sums
+        misfit = float(np.sqrt(squares / counted)) if counted > 0 else float("nan")
+        return misfit, max(1.0, np.nan_to_num(misfit) ** 2)
+
+    def evidence_nats(self, known: Gains) -> float:
+        """Return how much more probable gains with parts as `known` make the contacts than the prior [nats].
+
+        The information of the contacts is that of the estimate less that of its prior, by their misfit.
         """
-        wide = np.flatnonzero(self._part_limits > 1)
-        if len(wide) == 0:
-            return 1.0
-        at = self._channels - 1 + wide
+        assert known.parts is not None
+        before, start = self._prior
+        _, widening = self._misfit
+        contacts = (self._information - before) / widening
+        right = (self._information @ self._values - before @ start) / widening
+
+        def log_evidence(values: FloatArray, information: FloatArray) -> float:
+            total, pull = contacts + information, right + information @ values
+            determinants = np.linalg.slogdet(information)[1] - np.linalg.slogdet(total)[1]
+            squares = pull @ np.linalg.solve(total, pull) - values @ information @ values
+            return float((squares + determinants) / 2)
+
+        log_gains = self._gain_basis.T @ _normalised_logs(known.factors, self._channels)
+        given = _information(known.parts.covariance, self._basis)
+        values = np.concatenate([log_gains, known.parts.offsets])
+        return log_evidence(values, given) - log_evidence(start, before)
+
+    def _most_likely_priors(self, score_variance: float) -> tuple[FloatArray, float]:
+        """Return the most likely standard deviations of gains and of parts, (p,), from those stated on; and
+        that of the parts that may be wider, over that stated."""
+        stds, widenings, free = self._widest.copy(), [], self._channels - 1
+        values = self._values
+        for group in (np.arange(free), np.arange(free, len(stds))):
+            wide = group[self._widest[group] > self._stated[group]]
+            widenings.append(self._widening(wide, values[wide], score_variance) if len(wide) else 1.0)
+            stds[wide] = np.minimum(widenings[-1] * self._stated[wide], self._widest[wide])
+        return stds, widenings[-1]
+
+    def _widening(self, at: NDArray[np.intp], values: FloatArray, score_variance: float) -> float:
+        """Return the most likely deviation of these parameters (k,), over that stated, from 1 on.
+
+        The contacts' information about them alone is that of the estimate less that of its prior.
+        """
         known = _inverse(_inverse(self._information)[np.ix_(at, at)])
-        score = known @ self._part_offsets[wide] / score_variance
-        known = (known - np.diag(self._part_limits[wide] ** -2.0)) / score_variance
-        ratios, evidence = np.geomspace(1.0, self._part_limits.max(), _PART_RATIOS), []
+        score = known @ values / score_variance
+        known = (known - np.diag(self._widest[at] ** -2.0)) / score_variance
+        ratios, evidence = np.geomspace(1.0, (self._widest[at] / self._stated[at]).max(), _PART_RATIOS), []
         for ratio in ratios:
-            std = np.minimum(ratio, self._part_limits[wide])
+            std = np.minimum(ratio * self._stated[at], self._widest[at])
             total = known + np.diag(std**-2.0)
             log_determinant = np.linalg.slogdet(total)[1] + 2 * np.log(std).sum()
             evidence.append(score @ np.linalg.solve(total, score) - log_determinant)
         return float(ratios[np.argmax(evidence)])
 
-    def _with_parts_as_wide(self, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return information, log gains and offsets of the parts with a prior of the parts that is `ratio`
-        times as wide as stated, up to their limits."""
+    def _with_priors(self, stds: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return information, log gains and offsets of the parts with other standard deviations (p,) before
+        any contact."""
         free = self._channels - 1
-        more = np.minimum(ratio, self._part_limits) ** -2.0 - self._part_limits**-2.0
-        information = self._information.copy()
-        information[free:, free:] += np.diag(more)
-        step: FloatArray = np.zeros(len(information))
-        step[free:] = -more * self._part_offsets
-        step = np.asarray(np.linalg.solve(information, step), dtype=np.float64)
+        more = stds**-2.0 - self._widest**-2.0
+        information = self._information + np.diag(more)
+        step = np.asarray(np.linalg.solve(information, -more * self._values), dtype=np.float64)
         return information, self._log_gains + self._gain_basis @ step[:free], self._part_offsets + step[free:]
 
     def _assess(self, std: float) -> tuple[GainStatus, str]:
@@ -475,6 +527,12 @@ class _GainStep(NamedTuple):
 
 def _inverse(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
+def _information(covariance: ArrayLike, basis: FloatArray) -> FloatArray:
+    """Return the information along the directions of a basis (c, k) that a covariance (c, c) leaves."""
+    known = basis.T @ np.asarray(covariance, dtype=np.float64) @ basis
+    return _inverse(known + 1e-18 * np.eye(len(known)))
 
 
 def _normalised_logs(gains: ArrayLike, channels: int) -> FloatArray:

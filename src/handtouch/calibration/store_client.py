@@ -91,7 +91,7 @@ class StoreClient:
         """Store new parts of a calibration with the rest of the newest one; None if that fails."""
         before, _ = self.newest_applicable(serial, mounting_point, now)
         known = before.calibration if before else Calibration()
-        keeps_foreign = known.law or (known.gains and gains is None)
+        keeps_foreign = known.law or known.second_law or (known.gains and gains is None)
         calibration = replace(
             known, gains=gains or known.gains, offsets=offsets or known.offsets, sheet=sheet or known.sheet
         )

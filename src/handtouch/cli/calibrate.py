@@ -6,17 +6,24 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from handtouch import client, wire
 from handtouch.calibration.store import StoreError
 from handtouch.cli import requests
 from handtouch.cli.errors import CommandError, failing
 from handtouch.cli.options import add_number, find_endpoint, integer
 from handtouch.cli.requests import add_request
+from handtouch.config import Deployment, NamedPad, load
 from handtouch.host.json_output import print_json
 from handtouch.procedures import calibrate
+from handtouch.procedures.calibrate import press_map
+from handtouch.record.recording import Recording
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_request(parser, run, config=False)
     parser.add_argument("pad", metavar="PAD", help='pad, such as "left/index_distal"')
     _add_guided(parser.add_argument_group("guided measurement with known weights"))
+    _add_map(parser.add_argument_group("map of positions from presses at known places"))
     _add_direct(parser.add_argument_group("direct setting; omitted values are left unchanged"))
 
 
@@ -72,6 +80,13 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
         metavar="FILE",
         help="fit readings recorded with --log instead of measuring",
     )
+    guided.add_argument(
+        "--grasps",
+        type=Path,
+        metavar="FILE",
+        help="fit forces in static grasps, from joint torques or the weight of what is held: JSON lines with "
+        "joints, torque_nm, contacts (docs/calibrations.md)",
+    )
     guided.add_argument("--plot", type=Path, metavar="PNG", help="plot current against force")
     guided.add_argument("--yes", action="store_true", help="apply the law without confirmation")
     guided.add_argument(
@@ -99,6 +114,26 @@ def _add_guided(guided: argparse._ArgumentGroup) -> None:
     )
 
 
+def _add_map(presses: argparse._ArgumentGroup) -> None:
+    presses.add_argument(
+        "--map",
+        type=Path,
+        metavar="NPZ",
+        help="write a press_map of the pad; needs --config and --positions, and presses it now, or takes the "
+        "presses of a recording that --from names",
+    )
+    presses.add_argument(
+        "--positions",
+        type=Path,
+        metavar="CSV",
+        help="places of the presses in their order: columns x_mm, y_mm from the corner of x0 and y0, or with "
+        "z_mm in the pad frame; force_n if known",
+    )
+    add_number(
+        presses, "--position-std-mm", "MM", "error of these places along each axis, 1 sigma", default=0.1
+    )
+
+
 def _add_direct(direct: argparse._ArgumentGroup) -> None:
     direct.add_argument("--name", help="id of the new calibration, published in contact messages (required)")
     direct.add_argument(
@@ -118,6 +153,13 @@ def _add_direct(direct: argparse._ArgumentGroup) -> None:
         metavar=("K", "ALPHA", "OHM"),
         help="contact_ohm_mm2, alpha and ohm_per_square, as in [sheet.NAME]",
     )
+    direct.add_argument(
+        "--second-law",
+        type=float,
+        nargs=3,
+        metavar=("K", "ALPHA", "OHM"),
+        help="the same of the pad's second sheet",
+    )
     add_number(
         direct,
         "--hertz-force-n",
@@ -135,25 +177,46 @@ def run(
     live: str | None,
     weights: str,
     from_file: Path | None,
+    grasps: Path | None,
     config: Path | None,
     name: str | None,
     gains: Sequence[float] | None,
     offsets: Sequence[float] | None,
     law: Sequence[float] | None,
+    second_law: Sequence[float] | None,
     hertz_force_n: float | None,
     new_sheet: bool,
+    map: Path | None,
+    positions: Path | None,
+    position_std_mm: float,
     **options: Any,
 ) -> int:
     """Measure a contact law, set a calibration or print the active one; `options` of `CalibrateOptions`.
 
     Exit status 0, 1 (no law found, no daemon, refused), 2 (wrong usage or invalid file).
     """
-    guided = bool(weights) or from_file is not None
-    values: dict[str, Any] = {"gains": gains, "offset_counts": offsets, "law": law}
+    if map is not None or positions is not None:
+        if map is None or positions is None or config is None:
+            raise CommandError("handtouch calibrate: --map needs --positions CSV and --config CONFIG", 2)
+        if weights or name is not None or new_sheet:
+            raise CommandError("handtouch calibrate: --map takes no weights and sets no calibration", 2)
+        with failing(2, ValueError, OSError):
+            stream = find_endpoint("live", live, config)
+        return _run_map(
+            _MapFiles(config, positions, from_file, map), pad, position_std_mm, stream, key, as_json
+        )
+    sources = [bool(weights), from_file is not None, grasps is not None]
+    guided = any(sources)
+    values: dict[str, Any] = {
+        "gains": gains,
+        "offset_counts": offsets,
+        "law": law,
+        "second_law": second_law,
+    }
     values = {option: value for option, value in values.items() if value is not None}
     if hertz_force_n is not None and law is None:
         raise CommandError("handtouch calibrate: --hertz-force-n is of the law that --law sets", 2)
-    if conflict := _find_conflict(guided, values, name, config, bool(weights) and from_file is not None):
+    if conflict := _find_conflict(guided, values, name, config, sum(sources) > 1):
         raise CommandError(f"handtouch calibrate: {conflict}", 2)
     with failing(2, ValueError, OSError):
         endpoint = find_endpoint("control", endpoint, config)
@@ -167,12 +230,19 @@ def run(
         raise CommandError(f"{from_file}: no such file; --from reads readings that --log recorded", 2)
     if guided and config is not None:
         guided_options = calibrate.CalibrateOptions(
-            pad=pad, config=config, weights=weights, from_file=from_file, as_json=as_json, **options
+            pad=pad,
+            config=config,
+            weights=weights,
+            from_file=from_file,
+            grasps=grasps,
+            as_json=as_json,
+            **options,
         )
         return _run_guided(guided_options, calibrate.DaemonEndpoints(stream, endpoint, key))
-    if law is not None:
-        values["law"] = dict(zip(("contact_ohm_mm2", "alpha", "ohm_per_square"), law, strict=True))
-        values["law"]["hertz_force_n"] = hertz_force_n
+    for name_of_law in {"law", "second_law"} & {*values}:
+        keys = "contact_ohm_mm2", "alpha", "ohm_per_square"
+        values[name_of_law] = dict(zip(keys, values[name_of_law], strict=True))
+        values[name_of_law]["hertz_force_n"] = hertz_force_n
     if name is not None:
         values["name"] = name
     return requests.run_request(
@@ -191,14 +261,97 @@ def _find_conflict(
 ) -> str:
     """Return the conflict between options with its remedy; empty if there is none."""
     if guided and (values or name is not None):
-        return "--weights and --from measure a law, --name, --gains, --offsets and --law set one; use either"
+        return (
+            "--weights, --from and --grasps measure laws, --name, --gains, --offsets and --law set them; "
+            "use either"
+        )
     if guided and config is None:
         return "--config CONFIG is missing: the deployment file that the daemon runs with"
     if two_sources:
-        return "--weights measures, --from reads recorded readings; use either"
+        return "--weights measures, --from and --grasps read what was recorded; use either"
     if values and name is None:
         return "--name NAME is missing: the id of the new calibration"
     return ""
+
+
+class _MapFiles(NamedTuple):
+    config: Path
+    positions: Path
+    recording: Path | None
+    out: Path
+
+
+def _run_map(
+    files: _MapFiles, pad: str, position_std_mm: float, stream: str, key: str | None, as_json: bool
+) -> int:
+    """Measure a map and write it. Exit status 0; 1: the presses don't fit the places."""
+    with failing(2, ValueError, OSError):
+        deployment = load(files.config)
+        entry = calibrate.find_pad(deployment, pad)
+        places = press_map.read_places(files.positions)
+        job = press_map.MapJob(deployment, entry)
+        collector = press_map.PressCollector()
+        if files.recording is not None:
+            _read_presses(files.recording, deployment, entry, collector)
+        else:
+            _await_presses(stream, key, entry, places, collector)
+    if len(collector.presses) != len(places):
+        raise CommandError(
+            f"{len(collector.presses)} presses were held long enough, {files.positions} has {len(places)} "
+            "places: hold each for a second, a second apart, and leave out of the table what wasn't pressed",
+            1,
+        )
+    with failing(1, ValueError, OSError):
+        presses = job.presses(collector.presses, places, collector.samples, position_std_mm)
+        files.out.write_bytes(presses.data)
+        report = job.report(presses)
+    if as_json:
+        print_json({"file": str(files.out), **asdict(report)})
+    else:
+        print("\n".join(report.lines()))
+        print(f'Wrote {files.out}: press_map = "{files.out.name}" in the [[hand.pad]] of {entry.name}')
+    return 0
+
+
+def _read_presses(
+    file: Path, deployment: Deployment, entry: NamedPad, collector: press_map.PressCollector
+) -> None:
+    """Collect the presses of a recording."""
+    row, pads = deployment.pads.index(entry), len(deployment.pads)
+    column = wire.COLUMNS[wire.TickInputs]["counts"]
+    recording = Recording(file)
+    with recording.checked():
+        for message in recording.read("tick", "contact"):
+            if message.topic == f"contact/{entry.name}" and not message.payload["retained"]:
+                collector.add_event(message.payload["event"])
+            elif message.topic == "tick" and not message.payload["stopped"]:
+                counts = column.to_array(message.payload["counts"], pads)[row]
+                collector.add_counts(message.payload["t_ns"], counts.astype(np.float64))
+
+
+def _await_presses(
+    stream: str,
+    key: str | None,
+    entry: NamedPad,
+    places: Sequence[press_map.Place],
+    collector: press_map.PressCollector,
+) -> None:
+    """Ask for the presses one by one on standard error, and collect them."""
+    column, asked = wire.COLUMNS[wire.Raw]["counts"], -1
+    topics = f"raw/{entry.hand}", f"contact/{entry.name}"
+    with contextlib.closing(client.connect(*topics, endpoint=stream, key=key)) as messages:
+        while (done := len(collector.presses)) < len(places):
+            if asked != done:
+                at = ", ".join(f"{1e3 * part:.1f}" for part in places[done].at_m)
+                print(f"[{done + 1}/{len(places)}] press at ({at}) mm for a second", file=sys.stderr)
+                asked = done
+            message = messages.recv(1.0)
+            if isinstance(message, wire.Contact) and not message.retained:
+                collector.add_event(message.event)
+            elif isinstance(message, wire.Raw):
+                counts = column.to_array(message.counts, len(message.links))
+                row = message.links.index(entry.pad.link)
+                collector.add_counts(message.t_ns, counts[row].astype(np.float64))
 
 
 def _run_new_sheet(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
@@ -217,9 +370,13 @@ def _run_new_sheet(options: calibrate.CalibrateOptions, endpoints: calibrate.Dae
 def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
     # RuntimeError: the daemon refuses
     with failing(2, ValueError), failing(1, calibrate.CalibrationError, StoreError, OSError, RuntimeError):
-        if options.from_file is not None:
-            result = calibrate.refit_recording(options, options.from_file, datetime.now(UTC))
-            failed = bool(result.report.fit.problems)
+        if (file := options.from_file or options.grasps) is not None:
+            now = datetime.now(UTC)
+            if options.grasps is not None:
+                result = calibrate.fit_grasps(options, file, endpoints, now)
+            else:
+                result = calibrate.refit_recording(options, file, now)
+            failed = bool(result.report.problems)
             if not options.as_json:
                 print("\n".join(result.lines))
         else:

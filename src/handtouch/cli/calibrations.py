@@ -280,7 +280,7 @@ def _print_version(version: CalibrationVersion) -> None:
             print(text)
     for name, _, value in differences(Calibration(), version.calibration):
         print(f"{name:<22} {_format_value(value)}")
-    for name in ("gains", "law"):
+    for name in ("gains", "law", "second_law"):
         if part := getattr(version.calibration, name):
             deviations = [part.covariance[i][i] ** 0.5 for i in range(len(part.covariance))]
             print(f"{name + ' std':<22} {_format_value(deviations)}")
@@ -296,7 +296,8 @@ def _summary_line(version: CalibrationVersion) -> str:
 
 def _content_text(version: CalibrationVersion) -> str:
     origin = version.provenance
-    parts = [name for name in ("gains", "offsets", "law", "sheet") if getattr(version.calibration, name)]
+    names = "gains", "offsets", "law", "second_law", "sheet"
+    parts = [name for name in names if getattr(version.calibration, name)]
     return (
         f"{'+'.join(parts)}: {origin.method}, {origin.contacts} contacts"
         f"{'  FROM ANOTHER SENSOR' if origin.foreign else ''}{f'  ({origin.note})' if origin.note else ''}"

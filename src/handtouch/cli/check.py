@@ -80,11 +80,15 @@ def _print_summary(path: Path, facts: dict[str, Any], warnings: list[str]) -> No
                 f"    {pad['link']:<16} {pad['bus']} node 0x{pad['node_id']:02X}  {pad['surface']:<8} "
                 f"{length_mm:5.1f} x {width_mm:5.1f} mm  {_measured(pad)}  {serial}"
             )
-        if limited := [pad for pad in hand["pads"] if pad["measured_force_n"] is not None]:
-            needed_ma = max(pad["needed_full_scale_ma"] for pad in limited)
+        for key in ("needed_full_scale_ma", "needed_full_scale"):
+            limited = [pad for pad in hand["pads"] if pad["measured_force_n"] is not None and key in pad]
+            if not limited:
+                continue
+            needed = max(pad[key] for pad in limited)
             print(
                 "    beyond these forces a contact beside an electrode exceeds its channel: it goes on, its "
-                f"force is a lower bound; full_scale_ma = {needed_ma:.1f} measures max_force_n anywhere"
+                f"force is a lower bound; {key.removeprefix('needed_')} = {needed:.1f} measures max_force_n "
+                "anywhere"
             )
     for warning in warnings:
         print(f"  warning: {warning}")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from handtouch.design.layout import ElectrodeLayout
     from handtouch.design.optimise import DesignResult
     from handtouch.design.pad_task import PadTask
+    from handtouch.design.sheets import SheetCase
 
 _COLUMNS = ("electrode", "from, mm", "to, mm", "then bare", "series, ohm")
 _PREFIX = "handtouch design: "
@@ -104,6 +107,7 @@ def run(
     from handtouch.design.layout import FabricationLimits
     from handtouch.design.optimise import optimise_layout
     from handtouch.design.pad_task import PadTask
+    from handtouch.design.sheets import compare_sheets
     from handtouch.simulate.worlds import WORLDS
 
     described = WORLDS[world].draw(_CHECK_SEED).describe(config.load(config_path))
@@ -113,10 +117,17 @@ def run(
         result = optimise_layout(task, GOALS[goal], statistic, limits, electrodes, progress.update)
         simulated = _simulated(task, result, world, progress) if check else None
         files, no_tables = _write(config_path, task, result, world, out, progress)
+        forces_n = _sheet_forces(task)
+        sheets = compare_sheets(task, forces_n) if goal == "force" else []
     if as_json:
-        print_json(_as_json(task, result, simulated, files) | {"no_tables": no_tables})
+        made = _as_json(task, result, simulated, files) | {"no_tables": no_tables}
+        if sheets:
+            made |= {"sheets": [asdict(case) for case in sheets], "sheet_forces_n": forces_n}
+        print_json(made)
     else:
         _print(task, result, world, simulated, files, no_tables)
+        if sheets:
+            _print_sheets(forces_n, sheets)
     return 0
 
 
@@ -206,6 +217,28 @@ def _write(
         (out / name).write_text(text, encoding="utf-8")
         files.append(out / name)
     return files, no_tables
+
+
+def _sheet_forces(task: PadTask) -> list[float]:
+    """Return the forces [N] at which sheets are compared: a light, the asked and a firm one."""
+    most_n = task.sheet.max_force_n or math.inf
+    return sorted(force_n for force_n in {0.1, task.force_n, 5 * task.force_n} if force_n <= most_n)
+
+
+def _print_sheets(forces_n: Sequence[float], sheets: Sequence[SheetCase]) -> None:
+    """Print what other layers would make of the force."""
+    at = " / ".join(f"{force_n:g}" for force_n in forces_n)
+    print(f"expected deviation of force and of contact radius, and the sheet's load, % at {at} N:")
+    table = make_table("alpha", "second sheet", "force", "radius", "current of most")
+    for case in sheets:
+        columns = (case.force_std, case.radius_std, case.current_fraction)
+        second = "none" if case.second_alpha is None else f"alpha {case.second_alpha:g}"
+        table.add_row(
+            f"{case.alpha:g}" + (" (configured)" if case.is_configured else ""),
+            second,
+            *(" / ".join(f"{100 * value:.2g}" for value in values) for values in columns),
+        )
+    output_console().print(table)
 
 
 def _rows(task: PadTask, layout: ElectrodeLayout) -> list[dict[str, Any]]:

@@ -21,7 +21,6 @@ from handtouch.node.noise import PadNoise, measure_noise, position_noise
 from handtouch.node.settings import NodeFile, json_schema, load
 
 _PREFIX = "handtouch node: "
-_NOISE_COLUMNS = ("channel", "mean, A", "1 sigma, A", "1 sigma, counts")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -92,10 +91,12 @@ def _print_noise(
         return 0
     for noise, errors in pairs:
         print(f"pad {noise.pad.name}: {noise.samples} samples")
-        table = make_table(*_NOISE_COLUMNS, right=_NOISE_COLUMNS[1:])
+        scale, unit = (1e-3, ", A") if noise.pad.full_scale is None else (1.0, "")
+        names = f"mean{unit}", f"1 sigma{unit}", "1 sigma, counts"
+        table = make_table("channel", *names, right=names)
         columns = zip(noise.pad.channels, noise.mean_ma, noise.std_ma, noise.std_counts, strict=True)
         for channel, mean, std, counts in columns:
-            table.add_row(channel, f"{1e-3 * mean:.3e}", f"{1e-3 * std:.3e}", f"{counts:.2f}")
+            table.add_row(channel, f"{scale * mean:.3e}", f"{scale * std:.3e}", f"{counts:.2f}")
         output_console().print(table)
         for link, force, median, worst in errors:
             print(
@@ -108,12 +109,13 @@ def _print_noise(
 
 
 def _noise_map(noise: PadNoise, errors: list[tuple[str, float, float, float]]) -> dict[str, Any]:
+    scale, unit = (1e-3, "_a") if noise.pad.full_scale is None else (1.0, "")
     return {
         "pad": noise.pad.name,
         "samples": noise.samples,
         "channels": noise.pad.channels,
-        "mean_a": 1e-3 * noise.mean_ma,
-        "std_a": 1e-3 * noise.std_ma,
+        f"mean{unit}": scale * noise.mean_ma,
+        f"std{unit}": scale * noise.std_ma,
         "std_counts": noise.std_counts,
         "position": [
             {"link": link, "force_n": force, "median_m": median, "worst_m": worst}

@@ -36,7 +36,14 @@ from handtouch.record.replay_recording import first_config, replay_recording
 from handtouch.view.message_lines import contact_line
 
 _COMPARISON_COLUMNS = (
-    *("link", "contacts", "only recorded", "only replayed", "samples", "shift mm", "95 %", "force"),
+    "link",
+    "contacts",
+    "only recorded",
+    "only replayed",
+    "samples",
+    "shift mm",
+    "95 %",
+    "force",
     "begin ms",
 )
 
@@ -119,7 +126,7 @@ def run(
     with failing(1, OSError, ValueError), failing(2, ConfigError, KeyFileError), ExitStack() as stack:
         if recording is not None:
             return _replay_recording(
-                *(recording, deployment, on_contact, settings, speed, report, stack), recompute=recompute
+                recording, deployment, on_contact, settings, speed, report, stack, recompute=recompute
             )
         if deployment is None:
             raise CommandError(f"{path}: a CAN log needs a deployment file: handtouch replay LOG CONFIG", 2)

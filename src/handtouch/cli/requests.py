@@ -190,14 +190,15 @@ def calibration_lines(answer: Reply) -> Iterator[str]:
     active, previous = answer["calibration_id"], answer["previous_calibration_id"]
     was = "" if previous == active else f", was {previous}"
     yield f"{answer['hand']}/{answer['link']}: calibration {active}{was}"
-    law = answer["law"]
     yield f"gains    {'  '.join(f'{gain:.5g}' for gain in answer['gains'])}"
     yield f"offsets  {'  '.join(f'{offset:.1f}' for offset in answer['offset_counts'])} counts"
-    yield (
-        f"law      contact_ohm_mm2 {law['contact_ohm_mm2']:.5g}, alpha {law['alpha']:.4g}, "
-        f"ohm_per_square {law['ohm_per_square']:.5g}"
-        + (f", hertz_force_n {law['hertz_force_n']:.4g}" if law["hertz_force_n"] else "")
-    )
+    for name, law in (("law", answer["law"]), ("second", answer.get("second_law"))):
+        if law is not None:
+            hertz = f", hertz_force_n {law['hertz_force_n']:.4g}" if law["hertz_force_n"] else ""
+            yield (
+                f"{name:<8} contact_ohm_mm2 {law['contact_ohm_mm2']:.5g}, alpha {law['alpha']:.4g}, "
+                f"ohm_per_square {law['ohm_per_square']:.5g}{hertz}"
+            )
 
 
 def _with_arrays(answer: Reply) -> Reply:

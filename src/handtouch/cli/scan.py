@@ -150,7 +150,7 @@ def _print_bus(console: Console, report: BusReport, comparisons: dict[int, NodeC
     if nodes or comparisons:
         columns = ("id", "NMT state", "vendor", "product", "revision", "serial", "name", "channels", "EMCY")
         table = make_table(
-            *(*columns, "pad", ""), right=("id", "vendor", "product", "revision", "serial"), wrapped=("",)
+            *columns, "pad", "", right=("id", "vendor", "product", "revision", "serial"), wrapped=("",)
         )
         for node_id in sorted(nodes.keys() | comparisons.keys()):
             node = nodes.get(node_id, NodeFacts(node_id))

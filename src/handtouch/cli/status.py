@@ -95,7 +95,7 @@ def print_status(answer: dict[str, Any], console: Console, verbose: bool = False
     _print_pads(answer["pads"], console, _VERBOSE_COLUMNS if verbose else _COLUMNS)
     _print_supervisor(answer, console, verbose)
     _print_rejected_adaptation(answer, console)
-    _print_failed_shear_channels(answer, console)
+    _print_failed_channels(answer, console)
     percepts = service.get("percepts")
     if percepts is not None and (percepts["restarts"] or (verbose and percepts["state"] != "stopped")):
         console.print(f"percepts {_process_text(percepts)}; {percepts['dropped']} messages dropped")
@@ -230,11 +230,14 @@ def _print_rejected_adaptation(answer: dict[str, Any], console: Console) -> None
         console.print(text)
 
 
-def _print_failed_shear_channels(answer: dict[str, Any], console: Console) -> None:
-    """Print the pads whose shear pad has a failed channel."""
+def _print_failed_channels(answer: dict[str, Any], console: Console) -> None:
+    """Print the pads whose shear pad or second sheet has a failed channel."""
     for pad in answer["pads"]:
         if (status := pad.get("shear_status", "")) in ("dead", "saturated", "shorted"):
             text = f"{pad['hand']}/{pad['link']}: channels of the shear pad {status}; check its leads"
+            console.print(text, style="yellow")
+        if (status := pad.get("second_sheet_status", "operational")) not in ("", "operational", "no_zero"):
+            text = f"{pad['hand']}/{pad['link']}: second sheet {status}; check its lead and its layer"
             console.print(text, style="yellow")
 
 

@@ -18,7 +18,9 @@ from handtouch import wire
 from handtouch.client.subscriber import request
 from handtouch.host.endpoints import CONTROL_ENDPOINT
 
-Output = Literal["position", "force", "palm", "base", "raw", "motion", "shape", "friction", "object"]
+Output = Literal[
+    "position", "force", "palm", "base", "raw", "motion", "shape", "friction", "object", "stiffness"
+]
 SHORT_TIMEOUT_S, LONG_TIMEOUT_S = 3.0, 60.0
 SLOW_COMMANDS = ("tare", "reload")
 M = TypeVar("M")
@@ -35,6 +37,8 @@ class TareResult(TypedDict):
     samples: int
     offset_counts: list[float]
     """active now"""
+    second_offset_counts: NotRequired[float | None]
+    """of a second sheet's channel; None without one"""
     mean_counts: NotRequired[list[float]]
     std_counts: NotRequired[list[float]]
     begin_threshold_n: NotRequired[float]
@@ -101,6 +105,8 @@ class PadCalibration(TypedDict):
     gains: list[float]
     offset_counts: list[float]
     law: LawValues
+    second_law: NotRequired[LawValues | None]
+    """of its second sheet; None without one"""
     store: str | None
     """path of the calibration store that the daemon reads; None without supervisor"""
 
@@ -207,15 +213,22 @@ class DaemonControl:
         gains: Sequence[float] | None = None,
         offset_counts: Sequence[float] | None = None,
         law: LawValues | None = None,
+        second_law: LawValues | None = None,
     ) -> PadCalibration:
-        """Set gains (c,), offsets (c,) or the law of one pad under a calibration's name; return all of it.
+        """Set gains (c,), offsets (c,) or laws of one pad under a calibration's name; return all of it.
 
         With the pad alone, nothing changes.
         """
-        given = {"name": name, "gains": _list(gains), "offset_counts": _list(offset_counts), "law": law}
+        given = {
+            "name": name,
+            "gains": _list(gains),
+            "offset_counts": _list(offset_counts),
+            "law": law,
+            "second_law": second_law,
+        }
         changes = {key: value for key, value in given.items() if value is not None}
         answer = self._request("calibrate", pad=pad, **changes)
-        return cast(PadCalibration, {key: answer[key] for key in PadCalibration.__annotations__})
+        return cast(PadCalibration, {key: answer.get(key) for key in PadCalibration.__annotations__})
 
     def reload(self, *, dry_run: bool = False) -> ReloadResult:
         """Read the deployment file again and apply it; `dry_run`: only return what would change."""

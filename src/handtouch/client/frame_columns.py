@@ -63,3 +63,13 @@ class FrameColumns:
         "(3, 3) part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all"
         " contacts of the pad, so that the difference of two positions has the rest [m^2]."
     )
+    contact_radius_status = FrameColumn[wire.ContactRadiusStatus]("Status of the contact's radius.")
+    contact_radius_m = FrameColumn[float]("Radius of the contact [m].")
+    contact_radius_std_m = FrameColumn[float]("Its standard deviation [m].")
+    length_m = FrameColumn[float](
+        "Length of the line that is as elongated; NaN where nothing is known of it [m]."
+    )
+    min_length_m = FrameColumn[float]("Lower end of its interval of 95 % [m].")
+    max_length_m = FrameColumn[float]("Upper end of its interval of 95 % [m].")
+    length_axis = FrameColumn[FloatArray]("(3,) unit vector along it, in the link's frame.")
+    length_axis_std_rad = FrameColumn[float]("Standard deviation of its direction.")

@@ -22,7 +22,7 @@ import zmq
 from zmq import zmq_poll
 
 from handtouch import wire
-from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.client.connection import Connection
 from handtouch.client.control import DaemonControl, Output, Scenes, TareResult
 from handtouch.client.daemon_clock import DaemonClock, age_limit_s
 from handtouch.client.hand_arrays import FrameName, HandArrays, LinkColumns
@@ -30,6 +30,7 @@ from handtouch.client.hand_state import HandState
 from handtouch.client.link_column import LinkColumn
 from handtouch.client.listener import Listener
 from handtouch.client.names import UnknownNameError, unknown_name
+from handtouch.client.socket_options import RECONNECT_OPTIONS
 from handtouch.client.subscriber import SERVICE_TIMEOUT_S, connect, request
 from handtouch.client.window import HandWindow
 from handtouch.client.wrench import Wrench

@@ -17,7 +17,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.client.connection import Connection
+from handtouch.client.socket_options import RECONNECT_OPTIONS
 from handtouch.host.closing import Closing
 from handtouch.host.endpoints import INPUTS_ENDPOINT
 from handtouch.wire.inputs import (
@@ -76,15 +77,17 @@ class Robot(Closing):
         velocity_rad_s: JointValues | None = None,
         position_std_rad: JointValues | float | None = None,
         gravity: Sequence[float] | None = None,
+        orientation: Sequence[float] | None = None,
     ) -> None:
         """Send joint positions of a hand, by joint name, at `t_ns` of time.monotonic_ns() (None: now).
 
         A sequence has the order of `joints(hand)`, and all of them. Prismatic joints in metres. Velocities
         and standard deviations are of the same joints; a single deviation applies to all. gravity: (3,) its
         direction in the frame of the hand's base, of any length; overrides the deployment's, for a hand on an
-        arm that its URDF doesn't contain. Raises ValueError for mappings with different joints and for
-        sequences of another length, LookupError as `joints`. The daemon leaves out joints whose position
-        isn't finite, and counts them.
+        arm that its URDF doesn't contain. orientation: quaternion x, y, z, w of the base's frame, likewise,
+        for magnetic pads. Raises ValueError for mappings with different joints and for sequences of another
+        length, LookupError as `joints`. The daemon leaves out joints whose position isn't finite, and counts
+        them.
         """
         names = tuple(position_rad) if isinstance(position_rad, Mapping) else self.joints(hand)
         std = position_std_rad
@@ -93,9 +96,9 @@ class Robot(Closing):
         std_rad = None if std is None else _to_array(std, names)
         velocity = None if velocity_rad_s is None else _to_array(velocity_rad_s, names)
         t_ns = time.monotonic_ns() if t_ns is None else t_ns
-        down = None if gravity is None else np.asarray(gravity, np.float64)
+        base = [None if pose is None else np.asarray(pose, np.float64) for pose in (gravity, orientation)]
         angles = _to_array(position_rad, names)
-        self._send(JointState(hand, t_ns, names, angles, velocity, None, std_rad, down))
+        self._send(JointState(hand, t_ns, names, angles, velocity, None, std_rad, *base))
 
     def send_forces(
         self,

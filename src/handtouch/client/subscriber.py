@@ -20,8 +20,9 @@ import msgpack
 import zmq
 
 from handtouch import wire
-from handtouch.client.connection import RECONNECT_OPTIONS, Connection
+from handtouch.client.connection import Connection
 from handtouch.client.names import UnknownNameError, topics_of_pattern, unknown_name
+from handtouch.client.socket_options import RECONNECT_OPTIONS
 from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
 

@@ -21,6 +21,7 @@ from handtouch.config.base import Table
 from handtouch.config.checks import problems_in, problems_in_buses
 from handtouch.config.objects import ObjectTable
 from handtouch.config.problems import ConfigError, Problem, problems_of
+from handtouch.config.responses import ResponseTable, presses_of
 from handtouch.config.shear import Shear
 from handtouch.config.surfaces import SurfaceTable, film_of, surface_table
 from handtouch.config.tables import (
@@ -54,6 +55,7 @@ __all__ = [
     "ObjectTable",
     "Pad",
     "Problem",
+    "ResponseTable",
     "Shear",
     "Sheet",
     "SurfaceTable",
@@ -65,6 +67,7 @@ __all__ = [
     "parse",
     "parse_bus",
     "parse_buses",
+    "presses_of",
     "surface_table",
     "with_bus",
 ]
@@ -85,7 +88,7 @@ def load(path: Path | str, buses: Iterable[str] = ()) -> Deployment:
 
 def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) -> Deployment:
     """Check the text of a deployment file; its paths are relative to `folder` (default: current folder)."""
-    raw = parse_toml(text, file)
+    raw, folder = parse_toml(text, file), folder or Path()
     if foreign := _foreign_tables(raw):
         raise ConfigError(file, (Problem("the file", "", foreign),))
     try:
@@ -93,31 +96,22 @@ def parse(text: str, file: str = "deployment.toml", folder: Path | None = None) 
     except ValidationError as error:
         raise ConfigError(file, problems_of(raw, error, TABLES, KINDS)) from error
     nodes = {
-        name: node.model_copy(update={"eds": str((folder or Path()) / node.eds)}) if node.eds else node
+        name: node.model_copy(update={"eds": str(folder / node.eds)}) if node.eds else node
         for name, node in deployment.nodes.items()
     }
     hands = tuple(
         hand.model_copy(
             update={
-                "urdf": _resolve_path(hand.urdf, folder or Path()) if hand.urdf else None,
-                "pads": tuple(_with_embedded_files(pad, folder or Path()) for pad in hand.pads),
+                "urdf": _resolve_path(hand.urdf, folder) if hand.urdf else None,
+                "pads": tuple(_with_embedded_files(pad, folder) for pad in hand.pads),
             }
         )
         for hand in deployment.hands
     )
-    objects = {
-        name: entry.model_copy(
-            update={
-                "shape": entry.shape.model_copy(update={"file": str((folder or Path()) / entry.shape.file)})
-            }
-        )
-        if entry.shape.kind == "mesh"
-        else entry
-        for name, entry in deployment.objects.items()
-    }
+    objects = {name: entry.with_embedded_files(folder) for name, entry in deployment.objects.items()}
     daemon = deployment.daemon
     if daemon.keys:
-        daemon = daemon.model_copy(update={"keys": str((folder or Path()) / daemon.keys)})
+        daemon = daemon.model_copy(update={"keys": str(folder / daemon.keys)})
     return _check_deployment(
         deployment.model_copy(update={"nodes": nodes, "daemon": daemon, "hands": hands, "objects": objects}),
         file,
@@ -214,13 +208,15 @@ def _resolve_path(name: str, folder: Path) -> str:
 
 def _with_embedded_files(pad: Pad, folder: Path) -> Pad:
     """Return a pad with the content of the files that it names."""
-    film = pad.resistance_map
-    return pad.model_copy(
-        update={
-            "surface": pad.surface.with_embedded_files(folder),
-            "resistance_map": embed_file(film, folder) if film else None,
-        }
-    )
+    files = {key: getattr(pad, key) for key in ("resistance_map", "press_map")}
+    embedded = {key: embed_file(file, folder) for key, file in files.items() if file}
+    tables = {"surface": pad.surface, "response": pad.response}
+    parts = {
+        key: table.with_embedded_files(folder)
+        for key, table in tables.items()
+        if isinstance(table, SurfaceTable | ResponseTable)
+    }
+    return pad.model_copy(update=parts | embedded)
 
 
 def _check_deployment(deployment: Deployment, file: str) -> Deployment:

@@ -3,7 +3,7 @@
 A channel is an integer, its count, or REAL32: count = value x counts per unit, rounded.
 
 Public names: `Channel`, `Channels`, `WritableObject`, `STANDARD_CHANNELS`, `PROFILE_TYPES`,
-`resolve_channels`, `order_by_electrode`, `order_channels`, `channel_states`, `shear_numbers`, `parse_object`,
+`resolve_channels`, `order_by_electrode`, `order_channels`, `channel_states`, `parse_object`,
 `parse_writable_object`, `node_channels`, `full_scale_counts`, `max_count`, `integer_limits`,
 `saturation_limits`.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 
 from handtouch.config import Node, Pad, eds
 from handtouch.config.eds import REAL32, ValueType
-from handtouch.config.tables import SIDE_ELECTRODES
+from handtouch.config.roles import ELECTRODE, channel_numbers, column_channels
 
 MAX_CHANNEL_BITS = 32
 _MIN_CONVERTER_BITS = 8  # no converter of a sensor node has fewer
@@ -177,12 +177,12 @@ def parse_writable_object(text: str) -> WritableObject:
 
 def order_by_electrode(channels: Channels, pad: Pad) -> Channels:
     """Return the channels of a pad's electrodes, in their order; `channels` are those of its node."""
-    return tuple(channels[pad.electrodes.index(name)] for name in pad.electrode_names)
+    return tuple(channels[number] for number in channel_numbers(pad, ELECTRODE))
 
 
 def order_channels(channels: Channels, pad: Pad) -> Channels:
-    """Return the channels of a pad's electrodes, then those of its shear pad's x0, xa, y0, yb."""
-    return *order_by_electrode(channels, pad), *(channels[number] for number in shear_numbers(pad))
+    """Return the channels of a pad by their roles, each in the order of the core's columns."""
+    return tuple(channels[number] for number in column_channels(pad))
 
 
 def channel_states(pad: Pad) -> tuple[int, ...]:
@@ -193,13 +193,6 @@ def channel_states(pad: Pad) -> tuple[int, ...]:
         next(number for number, state in enumerate(pad.switch_states) if name in state)
         for name in pad.electrode_names
     )
-
-
-def shear_numbers(pad: Pad) -> tuple[int, ...]:
-    """Return the numbers of the node's channels of a shear pad's electrodes x0, xa, y0, yb; () without."""
-    if pad.shear is None:
-        return ()
-    return tuple(len(pad.electrode_names) + pad.shear_electrodes.index(name) for name in SIDE_ELECTRODES)
 
 
 def node_channels(node: Node) -> Channels:

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS
 from handtouch.config.problems import Problem, suggest_name
+from handtouch.config.responses import ResponseTable, presses_of
+from handtouch.config.roles import CHANNEL_ROLES, channel_count
 from handtouch.config.shear import Shear
-from handtouch.config.surfaces import film_of
+from handtouch.config.surfaces import film_of, surface_triangles
 from handtouch.config.tables import (
-    MAX_ELECTRODES,
-    MIN_ELECTRODES,
     SIDE_ELECTRODES,
     Bus,
     Daemon,
@@ -38,6 +39,9 @@ _SURFACES_ABOVE_SHEAR = ("plane", "cylinder", "cone", "sphere", "revolution")
 _MAX_VALUE_LENGTH = 60  # of a text in an error: embedded files are longer
 _MAX_BESIDE = 0.2  # of a side, that places where a film was measured may be beside the pad
 _MAX_MEAN_RATIO = 1.5  # of a film's mean resistance and the stated one: three standard deviations of films
+_SIDE_KEYS = ("gap_mm", "gap_offsets_mm", "series_ohm")  # 0 where there are no electrodes
+MIN_ALPHA_DIFFERENCE = 0.2
+"""Of two sheets: below it, errors of alpha (0.05 each as stated by default) leave the radius open"""
 _MAX_OVERLAP_MM = 1e-6  # rounding where arcs end in one point
 
 
@@ -62,11 +66,13 @@ def problems_in(deployment: Deployment) -> Iterator[Problem]:
             name = f"{hand.name}/{pad.link}"
             location = f'[[hand.pad]] {number} "{name}": '
             yield from _check_references(location, pad, deployment)
-            in_wrong_unit = list(pad_unit_problems(location, pad))
-            yield from in_wrong_unit or _check_shape(location, pad, deployment)
-            yield from _check_electrodes(location, pad, deployment)
+            if not isinstance(pad.response, str):  # of which nothing is known
+                in_wrong_unit = list(pad_unit_problems(location, pad))
+                yield from in_wrong_unit or _check_shape(location, pad, deployment)
+                yield from _check_electrodes(location, pad, deployment)
             yield from _check_schedule(location, pad, deployment)
             yield from _check_shear_pad(location, pad)
+            yield from _check_second_sheet(location, pad, deployment)
             if pad.touch:
                 yield from _check_touch(f"{location}touch.", pad.touch)
             if (pad.bus, pad.node_id) in taken:
@@ -115,6 +121,11 @@ def _check_objects(deployment: Deployment) -> Iterator[Problem]:
                 f" = {entry.shape.head_diameter_mm:g}",
                 "must be more than diameter_mm; a bolt without a head is a cylinder",
             )
+        if entry.shape.kind == "mesh":
+            try:
+                surface_triangles(entry.shape.file, 1.0)
+            except ValueError as error:
+                yield Problem(f"[object.{name}]: shape.file", _format_value(entry.shape.file), str(error))
 
 
 def _check_names(section: str, key: str, names: list[str]) -> Iterator[Problem]:
@@ -258,6 +269,15 @@ def _check_node(location: str, node: Node) -> Iterator[Problem]:
             _format_value(node.heartbeat_timeout_ms),
             f"must be longer than heartbeat_ms = {node.heartbeat_ms}; usually three times as long",
         )
+    if (node.unit is None) != (node.full_scale is None):
+        key, other = ("unit", "full_scale") if node.full_scale is None else ("full_scale", "unit")
+        yield Problem(f"{location}: {key}", _format_value(getattr(node, key)), f"goes with {other}; add that")
+    if node.full_scale is not None and node.full_scale_ma != 1e3 * node.full_scale:
+        yield Problem(
+            f"{location}: full_scale_ma",
+            _format_value(node.full_scale_ma),
+            "is for currents, and full_scale for other signals; leave one of them out",
+        )
     lists: dict[str, Sequence[object]] = {"channel_scale": node.channel_scale}
     if node.idle is not None:
         lists["idle.delta_objects"] = node.idle.delta_objects
@@ -287,17 +307,37 @@ def _check_references(location: str, pad: Pad, deployment: Deployment) -> Iterat
         ("bus", "[[bus]]", [bus.name for bus in deployment.buses]),
         ("node", "[node.NAME]", list(deployment.nodes)),
         ("sheet", "[sheet.NAME]", list(deployment.sheets)),
+        ("response", "[response.NAME]", list(deployment.responses)),
         ("shear", "[shear.NAME]", list(deployment.shears)),
+        ("second_sheet", "[sheet.NAME]", list(deployment.sheets)),
     )
     for key, header, names in known:
         value = getattr(pad, key)
-        if value is not None and value not in names:
+        if key == "sheet" and pad.response:
+            continue
+        if isinstance(value, str) and value not in names:
             there = f"known: {', '.join(names)}" if names else "none is defined"
             yield Problem(
                 f"{location}{key}",
                 _format_value(value),
                 f"no {header} of that name; {suggest_name(value, names)}{there}",
             )
+
+
+def _check_response(location: str, pad: Pad, response: ResponseTable, node: Node | None) -> Iterator[Problem]:
+    """Check that a response exists on the pad's surface, and that nothing is stated of electrodes."""
+    for key in ("electrode_arcs_mm", "switch_states", "resistance_map", *_SIDE_KEYS):
+        value = np.any(getattr(pad, key)) if key in _SIDE_KEYS else getattr(pad, key) is not None
+        if value:
+            remedy = (
+                f'is of sheets with electrodes on a conductor, not of kind "{response.kind}"; leave it out'
+            )
+            yield Problem(f"{location}{key}", _format_value(getattr(pad, key)), remedy)
+    if node is not None and node.full_scale is None and not response.is_current:
+        remedy = f"[node.{pad.node}] measures a current; give it unit and full_scale, as `response` has it"
+        yield Problem(f"{location}node", _format_value(pad.node), remedy)
+    for key, remedy in response.problems(pad.surface.build()):
+        yield Problem(f"{location}response.{key}", _format_value(getattr(response, key)), remedy)
 
 
 def _check_electrodes(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
@@ -312,12 +352,13 @@ def _check_electrodes(location: str, pad: Pad, deployment: Deployment) -> Iterat
             remedy = f"needs {len(names)} values, one for each electrode, has {len(values)}"
             yield Problem(f"{location}{key}", _format_value(values), remedy)
     node = deployment.nodes.get(pad.node)
-    if node is not None and len(node.channels) != pad.channel_count:
-        shear = f" and its shear pad {len(pad.shear_electrodes)}" if pad.shear else ""
+    if node is not None and len(node.channels) != channel_count(pad):
+        counts = [(role.text, len(role.wired(pad))) for role in CHANNEL_ROLES.values()]
+        needed = " and ".join(text.format(count) for text, count in counts if count)
         yield Problem(
             f"{location}node",
             _format_value(pad.node),
-            f"has {len(node.channels)} channels, the pad {len(names)} electrodes{shear}; list as many "
+            f"has {len(node.channels)} channels, the pad {needed}; list as many "
             f"objects in channels of [node.{pad.node}], or of a kind of node for this pad",
         )
 
@@ -380,6 +421,25 @@ def _check_shear_pad(location: str, pad: Pad) -> Iterator[Problem]:
         yield Problem(f"{location}shear_electrodes", _format_value(pad.shear_electrodes), once)
 
 
+def _check_second_sheet(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
+    """Check that a pad's two sheets separate force from area, and that nothing else excludes the second."""
+    if pad.second_sheet is None:
+        return
+    key, value = f"{location}second_sheet", _format_value(pad.second_sheet)
+    sheets = [deployment.sheets.get(name) for name in (pad.sheet, pad.second_sheet)]
+    alphas = [sheet.alpha for sheet in sheets if sheet is not None]
+    if len(alphas) > 1 and abs(alphas[1] - alphas[0]) < MIN_ALPHA_DIFFERENCE:
+        yield Problem(
+            key,
+            value,
+            f"has alpha = {alphas[1]:g}, the pad's first sheet {alphas[0]:g}: they must differ by "
+            f"{MIN_ALPHA_DIFFERENCE:g} or more, or force and area can't be told apart; choose another sheet",
+        )
+    for other in ("switch_states", "resistance_map"):
+        if getattr(pad, other) is not None:
+            yield Problem(key, value, f"isn't supported together with {other}; leave one of them out")
+
+
 def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:
     """Check that electrodes on arcs follow each other along the outline of a pad with possible gaps."""
     key, value = f"{location}electrode_arcs_mm", _format_value(pad.electrode_arcs_mm)
@@ -387,8 +447,8 @@ def _check_arcs(location: str, pad: Pad) -> Iterator[Problem]:
     if surface.perimeter_m is None:
         yield Problem(key, value, "only pads with an outline or on a mesh have arcs; leave it out")
         return
-    if not MIN_ELECTRODES <= len(pad.arcs_mm) <= MAX_ELECTRODES:
-        remedy = f"names {len(pad.arcs_mm)} electrodes; {MIN_ELECTRODES} to {MAX_ELECTRODES} are supported"
+    if not MIN_CHANNELS <= len(pad.arcs_mm) <= MAX_CHANNELS:
+        remedy = f"names {len(pad.arcs_mm)} electrodes; {MIN_CHANNELS} to {MAX_CHANNELS} are supported"
         yield Problem(key, value, remedy)
         return
     whole = 1e3 * surface.perimeter_m
@@ -443,6 +503,29 @@ def _check_film(location: str, pad: Pad, deployment: Deployment) -> Iterator[Pro
         yield Problem(key, value, remedy)
 
 
+def _check_presses(location: str, pad: Pad) -> Iterator[Problem]:
+    """Check the file of a pad's presses, and that it is of this pad."""
+    if pad.press_map is None:
+        return
+    key, value = f"{location}press_map", _format_value(pad.press_map)
+    if pad.switch_states:
+        yield Problem(key, value, "isn't supported together with switch_states; leave one of them out")
+        return
+    try:
+        presses = presses_of(pad.press_map)
+        place = pad.surface.build().fractions_of_places(presses.place_m)
+    except ValueError as error:
+        yield Problem(key, value, str(error))
+        return
+    count = presses.signals.shape[1]
+    if count != len(pad.electrode_names):
+        yield Problem(key, value, f"signals of {count} channels; the pad has {len(pad.electrode_names)}")
+    elif not ((place > -_MAX_BESIDE) & (place < 1 + _MAX_BESIDE)).all():
+        away = int(np.abs(place - 0.5).max(axis=1).argmax())
+        remedy = f"press {away + 1} isn't on the pad; x_mm and y_mm are millimetres from its corner x0, y0"
+        yield Problem(key, value, remedy)
+
+
 def _check_shape(location: str, pad: Pad, deployment: Deployment) -> Iterator[Problem]:
     """Check that a pad's surface, gaps and series resistors are possible."""
     surface = pad.surface
@@ -451,6 +534,10 @@ def _check_shape(location: str, pad: Pad, deployment: Deployment) -> Iterator[Pr
         value = getattr(surface, key or "kind")
         yield Problem(f"{location}surface.{key or 'kind'}", _format_value(value), remedy)
     if problems:
+        return
+    yield from _check_presses(location, pad)
+    if isinstance(pad.response, ResponseTable):
+        yield from _check_response(location, pad, pad.response, deployment.nodes.get(pad.node))
         return
     yield from _check_film(location, pad, deployment)
     if pad.electrode_arcs_mm is not None:

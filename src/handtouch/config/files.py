@@ -11,8 +11,7 @@ from handtouch.config.tables import Deployment
 
 
 def deployment_files(deployment: Deployment) -> dict[str, bytes]:
-    """Return path -> content of the existing files that a deployment names: EDS, URDF and meshes."""
+    """Return path -> content of the existing files that a deployment names: EDS and URDF."""
     named = {node.eds for node in deployment.nodes.values() if node.eds}
     named |= {hand.urdf for hand in deployment.hands if hand.urdf}
-    named |= {known.shape.file for known in deployment.objects.values() if known.shape.kind == "mesh"}
     return {path: Path(path).read_bytes() for path in sorted(named) if Path(path).is_file()}

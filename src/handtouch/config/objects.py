@@ -6,11 +6,13 @@ Public names: `ObjectTable`, `OBJECT_SHAPES`, `MeshShape`, `BoltShape`, `BoxShap
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from handtouch.config.base import Table
+from handtouch.field.embedded_file import embed_file
 
 _Size = Annotated[float, Field(gt=0, le=1000)]
 
@@ -80,3 +82,10 @@ class ObjectTable(Table):
         description="its shape, see below",
         examples=[{"kind": "sphere", "diameter_mm": 60.0}],
     )
+
+    def with_embedded_files(self, folder: Path) -> ObjectTable:
+        """Return it with the content of its mesh, if it is one, whose path is relative to a folder."""
+        if self.shape.kind != "mesh":
+            return self
+        shape = self.shape.model_copy(update={"file": embed_file(self.shape.file, folder)})
+        return self.model_copy(update={"shape": shape})

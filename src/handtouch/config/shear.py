@@ -9,11 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from handtouch.config.base import Table
+from handtouch.config.base import Positive, Table
 from handtouch.field.elastic_layer import ElasticLayer
 from handtouch.field.shear import BarPattern, DiscPattern, FilmLaw, ShearPattern
 
-Positive = Annotated[float, Field(gt=0)]
 _MM = 1e-3
 
 

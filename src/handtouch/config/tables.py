@@ -7,13 +7,24 @@ follow one of several models.
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from handtouch.config.base import Table
+from handtouch.config.base import (
+    CHANNEL_RANGE,
+    PER_CHANNEL,
+    Name,
+    NonNegative,
+    Positive,
+    PositivePerChannel,
+    Table,
+    Vector3,
+)
 from handtouch.config.objects import OBJECT_SHAPES, ObjectTable
+from handtouch.config.responses import RESPONSES, PadResponse, ResponseTable, response_of
 from handtouch.config.shear import SHEAR_PATTERNS, Shear
 from handtouch.config.surfaces import SURFACE_TABLES, PadSurface
 from handtouch.host.endpoints import (
@@ -23,29 +34,24 @@ from handtouch.host.endpoints import (
     LIVE_ENDPOINT,
 )
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
-Vector3 = Annotated[tuple[float, float, float], Field(strict=False)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
 
 
 def _refuse_removed(output: object) -> object:
-    if output in ("stiffness", "texture"):
+    if output == "texture":
         raise PydanticCustomError("removed", "is no longer estimated; delete it from the list")
     return output
 
 
-Output = Literal["position", "force", "raw", "palm", "base", "motion", "shape", "friction", "object"]
+Output = Literal[
+    "position", "force", "raw", "palm", "base", "motion", "shape", "friction", "object", "stiffness"
+]
 RequestedOutput = Annotated[Output, BeforeValidator(_refuse_removed)]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
-MIN_ELECTRODES, MAX_ELECTRODES = 3, 16
 Electrode = Literal["x0", "xa", "y0", "yb"]
 SIDE_ELECTRODES: tuple[Electrode, ...] = ("x0", "xa", "y0", "yb")
-_PerChannel = Field(strict=False, min_length=MIN_ELECTRODES, max_length=MAX_ELECTRODES)
-PositivePerChannel = Annotated[tuple[Positive, ...], _PerChannel]
 MAX_STATES = 4
-SwitchState = Annotated[tuple[Name, ...], _PerChannel]
+SwitchState = Annotated[tuple[Name, ...], PER_CHANNEL]
 Arc = Annotated[tuple[float, float], Field(strict=False)]
 NodeId = Annotated[int, Field(ge=1, le=127)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -153,7 +159,7 @@ class Idle(Table):
     period_ms: Annotated[int, Field(ge=10, le=65_535)] = Field(
         100, description="event timer of the TPDO (0x1800 + n sub 5): the longest time between two samples"
     )
-    delta_objects: Annotated[tuple[str, ...], _PerChannel] = Field(
+    delta_objects: Annotated[tuple[str, ...], PER_CHANNEL] = Field(
         ("0x6426:1:u32", "0x6426:2:u32", "0x6426:3:u32", "0x6426:4:u32"),
         description="objects that delta_counts is written to, one per channel; default: 0x6426 sub 1 and up",
     )
@@ -162,8 +168,20 @@ class Idle(Table):
     )
 
 
+def _required_unless(key: str, *required: str) -> ConfigDict:
+    """Return the configuration of a table whose keys `required` aren't, where it has `key`."""
+
+    def change(schema: dict[str, Any]) -> None:
+        schema["required"] = [name for name in schema["required"] if name not in required]
+        schema["anyOf"] = [{"required": list(required)}, {"required": [key]}]
+
+    return ConfigDict(json_schema_extra=change)
+
+
 class Node(Table):
     """`[node.NAME]`: a kind of sensor node: its identity, channels, electronics and heartbeat."""
+
+    model_config = _required_unless("full_scale", "drive_v", "full_scale_ma")
 
     eds: str | None = Field(
         None,
@@ -176,10 +194,10 @@ class Node(Table):
     product_code: Unsigned32 | None = Field(
         None, description="expected product code (0x1018 sub 2); default: any", examples=[4]
     )
-    channels: Annotated[tuple[str, ...], _PerChannel] = Field(
+    channels: Annotated[tuple[str, ...], PER_CHANNEL] = Field(
         ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
-        description="objects of the 3 to 16 channels, INDEX:SUB; with a type (i16, u24) where no EDS has it, "
-        "REAL32 as f32/1000 for 1000 counts per unit",
+        description=f"objects of the {CHANNEL_RANGE} channels, INDEX:SUB; with a type (i16, u24) where no "
+        "EDS has it, REAL32 as f32/1000 for 1000 counts per unit",
     )
     allow_pdo_remapping: bool = Field(
         True, description="map the channels to a TPDO over SDO if no TPDO of the node carries them"
@@ -193,8 +211,23 @@ class Node(Table):
     )
     drive_v: Positive = Field(description="voltage between the conducting layer and the electrodes")
     full_scale_ma: Positive = Field(description="electrode current at full_scale_counts")
+    unit: str | None = Field(
+        None,
+        min_length=1,
+        max_length=16,
+        description="unit of what the channels measure, if that isn't a current; used in texts only",
+        examples=["N"],
+    )
+    full_scale: Positive | None = Field(
+        None,
+        description="signal at full_scale_counts in `unit`, of a pad with a response in that unit; instead "
+        "of drive_v and full_scale_ma",
+        examples=[32.767],
+    )
     full_scale_counts: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="count at full_scale_ma; default: max_count", examples=[32767]
+        None,
+        description="count at full_scale_ma, or full_scale; default: max_count",
+        examples=[32767],
     )
     max_count: Annotated[int, Field(ge=1)] | None = Field(
         None,
@@ -227,6 +260,12 @@ class Node(Table):
         description="object that switches the pad's excitation: 1 on, 0 off, e.g. 0x2100:0:u8",
         examples=["0x2100:0:u8"],
     )
+    sample_delay_ms: Annotated[float, Field(ge=0, le=1000)] = Field(
+        0.0,
+        description="mean time from a sample to the SYNC that it is sent with, of a node that doesn't sample "
+        "at SYNC: samples are dated so much earlier. `handtouch node` logs it",
+        examples=[4.0],
+    )
     heartbeat_ms: int = Field(
         100,
         ge=10,
@@ -243,7 +282,10 @@ class Node(Table):
     @model_validator(mode="before")
     @classmethod
     def _fill_channels(cls, values: Any) -> Any:
-        """Fill in what depends on the number of channels."""
+        """Fill in what depends on the number of channels, and on their unit."""
+        full_scale = values.get("full_scale") if isinstance(values, dict) else None
+        if isinstance(full_scale, int | float):  # a signal takes the place of a current, whatever its unit
+            values = {"drive_v": 1.0, "full_scale_ma": 1e3 * full_scale} | values
         channels = values.get("channels") if isinstance(values, dict) else None
         if not isinstance(channels, list | tuple) or len(channels) == len(SIDE_ELECTRODES):
             return values
@@ -454,6 +496,8 @@ class Touch(Table):
 class Pad(Table):
     """`[[hand.pad]]`: one area touch sensor on a link of the hand."""
 
+    model_config = _required_unless("response", "sheet", "gap_mm")
+
     link: Name = Field(description="link that carries the pad; also its name in topics")
     bus: Name = Field(description="name of the [[bus]] that its node is on")
     node_id: NodeId = Field(description="CANopen node id, 1 to 127")
@@ -463,17 +507,17 @@ class Pad(Table):
         "default: any, so a replaced sensor isn't detected",
     )
     node: Name = Field(description="kind of node, a [node.NAME] table")
-    electrodes: Annotated[tuple[Name, ...], _PerChannel] = Field(
+    electrodes: Annotated[tuple[Name, ...], PER_CHANNEL] = Field(
         SIDE_ELECTRODES,
         description="electrodes that the node's channels are wired to, in channel order; default: x0, xa, "
         "y0, yb, or those of electrode_arcs_mm",
     )
     electrode_arcs_mm: dict[Name, Arc] | None = Field(
         None,
-        description="of a pad with an outline or on a mesh, names of 3 to 16 electrodes in the order in "
-        "which they follow each other counter-clockwise, each with the part of the edge that it covers, less "
-        "gap_mm at both ends: lengths along it from the first vertex, on a mesh from the first corner; "
-        "default: one electrode between each two corners",
+        description=f"of a pad with an outline or on a mesh, names of {CHANNEL_RANGE} electrodes in the "
+        "order in which they follow each other counter-clockwise, each with the part of the edge that it "
+        "covers, less gap_mm at both ends: lengths along it from the first vertex, on a mesh from the "
+        "first corner; default: one electrode between each two corners",
     )
     switch_states: tuple[SwitchState, ...] | None = Field(
         None,
@@ -486,6 +530,12 @@ class Pad(Table):
         "estimated from the samples of all states; default: all are connected all the time",
     )
     sheet: Name = Field(description="kind of sheet, a [sheet.NAME] table")
+    response: PadResponse | Name | None = Field(
+        None,
+        description="kind of a pad that isn't a sheet with electrodes on a conductor, a [response.NAME] "
+        "table; then `electrodes` are its channels, and no key of electrodes is given; default: it is one",
+        examples=["taxel_array"],
+    )
     surface: PadSurface = Field(description="shape of the sensing surface")
     resistance_map: str | None = Field(
         None,
@@ -495,13 +545,21 @@ class Pad(Table):
         "coordinates of its file) and ohm_per_square, one value for each place; default: the same everywhere",
         examples=["film.npz"],
     )
+    press_map: str | None = Field(
+        None,
+        min_length=1,
+        description="NumPy archive (.npz) of presses of this pad at known places, relative to this file, by "
+        "which positions are estimated beside what is stated of the pad; `handtouch calibrate --map` makes "
+        "it; default: none",
+        examples=["tip_presses.npz"],
+    )
     gap_mm: NonNegative = Field(description="bare length of each side next to its corners, along the surface")
-    gap_offsets_mm: Annotated[tuple[Ends, ...], _PerChannel] = Field(
+    gap_offsets_mm: Annotated[tuple[Ends, ...], PER_CHANNEL] = Field(
         ((0.0, 0.0),) * 4,
         description="bare lengths besides gap_mm at the low and the high end of electrodes x0, xa, y0, yb, "
         "as `handtouch design` computes them, or at both ends of each arc; default: 0",
     )
-    series_ohm: Annotated[tuple[NonNegative, ...], _PerChannel] = Field(
+    series_ohm: Annotated[tuple[NonNegative, ...], PER_CHANNEL] = Field(
         (0.0, 0.0, 0.0, 0.0),
         description="series resistors of electrodes x0, xa, y0, yb, or of each arc, to ground; default: 0",
     )
@@ -516,13 +574,26 @@ class Pad(Table):
         description="electrodes of the shear pad that the node's channels after those of the pad are wired "
         "to, in channel order",
     )
+    second_sheet: Name | None = Field(
+        None,
+        description="kind of the second sheet in the pad's sandwich, a [sheet.NAME] table of another alpha: "
+        "force and contact radius are estimated from both. It has the first one's shape and electrodes, all "
+        "joined: the node's last channel is its total current. Default: none",
+        examples=["even"],
+    )
     touch: Touch | None = Field(None, description="thresholds of this pad; default: those of [touch]")
 
     @model_validator(mode="before")
     @classmethod
     def _fill_electrodes(cls, values: Any) -> Any:
         """Fill in what depends on the number of electrodes."""
-        arcs = values.get("electrode_arcs_mm") if isinstance(values, dict) else None
+        if not isinstance(values, dict):
+            return values
+        arcs: Any = values.get("electrode_arcs_mm")
+        if values.get("response") is not None:
+            values = {"sheet": "none", "gap_mm": 0.0} | values
+            arcs = response_of(values["response"])
+            arcs = arcs and dict.fromkeys(arcs.channels)
         if not isinstance(arcs, dict):
             return values
         count = len(arcs)
@@ -536,12 +607,9 @@ class Pad(Table):
     @property
     def electrode_names(self) -> tuple[str, ...]:
         """Names of the electrodes, in the order of the columns of all currents."""
+        if isinstance(self.response, ResponseTable):
+            return self.response.channels
         return SIDE_ELECTRODES if self.electrode_arcs_mm is None else tuple(self.electrode_arcs_mm)
-
-    @property
-    def channel_count(self) -> int:
-        """Number of channels of the pad's node: its electrodes', then those of its shear pad."""
-        return len(self.electrode_names) + (len(self.shear_electrodes) if self.shear else 0)
 
     @property
     def arcs_mm(self) -> tuple[tuple[float, float], ...]:
@@ -558,6 +626,11 @@ class Pad(Table):
     def state_count(self) -> int:
         """Number of states of `switch_states`; 1 without."""
         return len(self.switch_states or (0,))
+
+    @property
+    def is_magnetic(self) -> bool:
+        """True if the Earth's field shifts its zeros."""
+        return bool(getattr(self.response, "magnetic", False))
 
     @property
     def gaps_mm(self) -> tuple[tuple[float, float], ...]:
@@ -690,6 +763,11 @@ class NamedPad(NamedTuple):
         return f"{self.hand}/{self.pad.link}"
 
 
+@lru_cache(maxsize=256)
+def _checked_sheet(**values: Any) -> Sheet:
+    return Sheet.model_validate(values)
+
+
 class Deployment(Table):
     """The whole file."""
 
@@ -698,15 +776,50 @@ class Deployment(Table):
     buses: Annotated[tuple[Bus, ...], Field(strict=False, min_length=1)] = Field(alias="bus")
     nodes: dict[Name, Node] = Field(alias="node")
     sheets: dict[Name, Sheet] = Field(alias="sheet")
+    responses: dict[Name, PadResponse] = Field({}, alias="response")
     shears: dict[Name, Shear] = Field({}, alias="shear")
     objects: dict[Name, ObjectTable] = Field({}, alias="object")
     touch: Touch = Touch()
     hands: Annotated[tuple[HandTable, ...], Field(strict=False, min_length=1)] = Field(alias="hand")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _insert_responses(cls, values: Any) -> Any:
+        """Replace the name of a response in each pad by its table."""
+        responses = values.get("response") if isinstance(values, dict) else None
+        if not isinstance(responses, dict):
+            return values
+
+        def inserted(pad: Any) -> Any:
+            name = pad.get("response") if isinstance(pad, dict) else None
+            known = isinstance(name, str) and response_of(responses.get(name))
+            return pad | {"response": responses[name]} if known else pad
+
+        hands = values.get("hand")
+        if isinstance(hands, list | tuple):
+            hands = [
+                hand | {"pad": list(map(inserted, hand["pad"]))}
+                if isinstance(hand, dict) and isinstance(hand.get("pad"), list | tuple)
+                else hand
+                for hand in hands
+            ]
+            values = values | {"hand": hands}
+        return {"sheet": {}} | values
+
+    def sheet_of(self, pad: Pad) -> Sheet:
+        """Return the sheet of a pad, or the one that is equivalent to its response."""
+        if not isinstance(pad.response, ResponseTable):
+            return self.sheets[pad.sheet]
+        return _checked_sheet(**pad.response.sheet_values())
+
     @property
     def pads(self) -> list[NamedPad]:
         """All pads in the order of the file; a pad's row everywhere is its index here."""
         return [NamedPad(hand.name, pad) for hand in self.hands for pad in hand.pads]
+
+    def touch_of(self, pad: Pad) -> Touch:
+        """Return the thresholds of a pad: its own, or those of all."""
+        return pad.touch or self.touch
 
     @property
     def pad_names(self) -> list[str]:
@@ -747,6 +860,7 @@ TABLES: dict[str, type[Table]] = {
 }
 KINDS: dict[str, dict[str, type[Table]]] = {
     "surface": {**SURFACE_TABLES},
+    "response": {**RESPONSES},
     "pattern": {**SHEAR_PATTERNS},
     "shape": OBJECT_SHAPES,
 }

@@ -14,8 +14,9 @@ from handtouch.calibration.calibration import LawParameters, LearnedParts
 class ActiveCalibration:
     """Calibration of a pad, and what is known about its quality.
 
-    gains: (n,) of the electrodes. law: None, the deployment's. gain_covariance: (n n,) of log gains;
-    None, as the deployment states. parts: learned with the gains; None, as the deployment states.
+    gains: (n,) of the electrodes. law, second_law: of the pad's sheet, and of its second one; None, the
+    deployment's. gain_covariance: (n n,) of log gains; None, as the deployment states. parts: learned with
+    the gains; None, as the deployment states.
     quarantined: no force is published. diagnoses: names of those responsible for `quarantined` or
     `position_unreliable`. dead_electrode: index of an electrode that is connected to nothing, without which
     contacts are located.
@@ -30,3 +31,4 @@ class ActiveCalibration:
     position_unreliable: bool = False
     dead_electrode: int | None = None
     diagnoses: tuple[str, ...] = ()
+    second_law: LawParameters | None = None

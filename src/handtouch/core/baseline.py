@@ -1,6 +1,6 @@
 """Baselines: counts of untouched pads, tracked while a pad is untouched and held while it is touched.
 
-Public name: `Baseline`.
+Public names: `Baseline`, `BaselineSettings`.
 
 Ticks only collect samples (`stages.detect`, the `block_...` arrays of the state); a tenth of a second of them
 is then processed at once (`update_baseline`), with its duration, so that tick rate and missing samples make
@@ -8,7 +8,10 @@ no difference. Rules:
 * An untouched pad's baseline is tracked with a time constant, up to a maximum rate: a slower rise is drift.
 * No contact lowers a channel. Where one falls slowly, the whole reading is drift and is tracked at any rate;
   a step is a fault, not drift.
-* A quiet pad whose baseline was never known has the zeros that it reads, if no contact could cause them.
+* A quiet pad whose baseline was never known, or held while it was touched, has the zeros that it reads, if no
+  contact could cause them.
+* While a pad is touched, a channel that falls below its baseline slowly takes that along. What is left of a
+  much firmer contact, and lies still, is the drift of the meantime, if it isn't more than that may be.
 * Hum and noise move channels below the baseline as often as above it. Their amplitude raises thresholds.
 * A touched pad's baseline is held, after release too, until the pad reads nearly its baseline again: leakage
   or creep neither triggers another contact nor becomes the baseline.
@@ -22,10 +25,12 @@ no difference. Rules:
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.core.link_load import LinkLoad
 from handtouch.core.state import TickState
 
 FloatArray = npt.NDArray[np.float64]
@@ -50,53 +55,64 @@ _MAX_FALL_SIGMA = 10.0  # more is a step: such samples are implausible, see `sta
 _MIN_FALL_FRACTION = 0.02  # of all channels: as much may be a wrong gain
 _MIN_CONTACT_SPREAD = 0.3  # of the mean of a pad's channels; drift of temperature or supply moves them alike
 _QUIET_SIGMA = 3.0  # of a channel's noise in a block: not held by a hand
+_STILL_S = 10.0  # time after which what is left of a contact is drift
+_MAX_LEFT_FRACTION, _MAX_LEFT_THRESHOLDS = 0.1, 2.0  # of the contact's largest current; of what begins one
 _MIN_CROSSINGS = 6.0  # of the mean in a block: 31 Hz, a hand touches and trembles more slowly
 _DISTURBANCE_TIME_S = 60.0  # time in which a disturbance that has gone is forgotten
+_TURN_SIGMA = 2.0  # of what turns may do to a pad, all channels alike, over thresholds
 _DISTURBANCE_MARGIN = 1.5  # of thresholds over the sum of the amplitudes
-_GRAVITY_GAIN, _MIN_TURN_SQUARED = 0.02, 0.05  # fraction of an innovation; squared change of unit gravity
+
+
+class BaselineSettings(NamedTuple):
+    """Settings of n pads, all (n,)."""
+
+    noise_counts: FloatArray
+    """configured noise of a channel"""
+    begin_counts: FloatArray
+    """sum of channels at which a contact begins"""
+    end_counts: FloatArray
+    """sum of channels at which it ends"""
+    max_rise_time_s: FloatArray
+    """a reading that takes longer to rise to `end_counts` is drift"""
+    magnetic: BoolArray | bool = False
+    """zeros shift with the link's orientation, not with gravity on it"""
 
 
 class Baseline:
     """Baselines of the channels of n pads [counts]; `hands` are the rows of each hand.
 
-    noise_counts: configured noise of a channel. begin_counts, end_counts: sums of channels at which a contact
-    begins and ends. max_rise_time_s: a reading that takes longer to rise to `end_counts` is drift. All (n,).
     electrode_counts: (n,) number of channels of each pad, those of `state` by default.
 
     Public state: `offset` (n, c); `std` (n,) of the sum of the channels; `noise_squared` (n, c) [counts^2] of
     untouched samples; `held` (n,): touched, or released and not back yet; `unverified` (n,): no reading has
     agreed with the baseline yet; `known` (n,): set, or measured untouched; `drift_speed` (n,): recent drift
-    of the sum, without the common one [counts/s]; `gravity_slope` (n, c, 3): change of a channel per unit of
-    gravity; `disturbance` (n, c): amplitude of hum and noise [counts], by which `threshold_factor` (n,)
-    raises the thresholds of contacts.
+    of the sum, without the common one [counts/s]; `link_load`: what gravity and acceleration add;
+    `disturbance` (n, c): amplitude of hum and noise [counts], by which `threshold_factor` (n,) raises the
+    thresholds of contacts.
     """
 
     def __init__(
         self,
-        noise_counts: FloatArray,
-        begin_counts: FloatArray,
-        end_counts: FloatArray,
-        max_rise_time_s: FloatArray,
+        settings: BaselineSettings,
         hands: Iterable[slice],
         state: TickState | None = None,
         electrode_counts: IntArray | None = None,
     ) -> None:
-        n, hands = len(noise_counts), list(hands)
+        noise_counts, hands = settings.noise_counts, list(hands)
+        n = len(noise_counts)
         self._hands = hands
         held = TickState.empty(n, len(hands)) if state is None else state
         self._channels = np.full(n, held.channels) if electrode_counts is None else electrode_counts
         self._used = (np.arange(held.channels) < self._channels[:, None]).astype(np.float64)
         self._ones, self._root_channels = np.ones(held.channels), np.sqrt(self._channels)
-        self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+        self.link_load = LinkLoad(held)
+        self._set_limits(settings)
         self.offset, self.std, self.noise_squared = held.offset, held.offset_std, held.noise_squared
         self.held, self.unverified, self.known = held.held, held.unverified, held.known
         self.touching, self.drift_speed = held.block_touching, held.drift_speed
-        self.gravity, self.gravity_slope = held.gravity, held.gravity_slope
-        """`gravity` (n, 3): unit direction in each link's frame, of the last `set_gravity`; 0: never known"""
-        self.smoothed_gravity = held.smoothed_gravity  # with the time constant of the offset
         self.common_drift = held.common_drift
         """drift per channel common to each hand's pads"""
-        self.std[:] = begin_counts / _CONFIDENCE_SIGMA
+        self.std[:] = settings.begin_counts / _CONFIDENCE_SIGMA
         self.noise_squared[:] = np.square(noise_counts)[:, None] * self._used
         self._update_channel_noise()
         self.drift_speed[:] = _INITIAL_DRIFT_SIGMA_PER_S * noise_counts
@@ -112,18 +128,13 @@ class Baseline:
         self._span_crossings, self._span_level = held.span_crossings, held.span_level
         self._earlier, self.disturbance = held.earlier_disturbance, held.disturbance
         self.threshold_factor = held.threshold_factor
+        self._begin_ns, self._peak_level, self._still_s = held.begin_ns, held.peak_level, held.still_s
         self._drift_until_ns = held.drift_until_ns  # time of each pad's last offset update
         self._anchor, self._anchored_s = held.drift_anchor, held.drift_anchored_s
 
-    def set_settings(
-        self,
-        noise_counts: FloatArray,
-        begin_counts: FloatArray,
-        end_counts: FloatArray,
-        max_rise_time_s: FloatArray,
-    ) -> None:
+    def set_settings(self, settings: BaselineSettings) -> None:
         """Change the settings of all pads. Call it also after the state was loaded."""
-        self._set_limits(noise_counts, begin_counts, end_counts, max_rise_time_s)
+        self._set_limits(settings)
         self._update_channel_noise()
         self._update_expected()
 
@@ -132,7 +143,8 @@ class Baseline:
         store or a tare. The next reading is a contact only if it differs by more than these explain."""
         count = self._channels[pad]
         self.offset[pad, :count] = offset
-        self.offset[pad] -= self.gravity_slope[pad] @ self.gravity[pad]
+        if (load := self.link_load.expected_counts()) is not None:
+            self.offset[pad] -= load[pad]
         self.std[pad] = np.sqrt(np.sum(np.square(np.broadcast_to(std, count))))
         self.unverified[pad] = self.known[pad] = True
         self.held[pad] = self.touching[pad]
@@ -142,7 +154,7 @@ class Baseline:
 
     def reset_pad(self, pad: int) -> None:
         """Forget what was learned of a pad, because its node was replaced."""
-        self.gravity_slope[pad] = 0.0
+        self.link_load.reset_pad(pad)
         self.noise_squared[pad] = self._noise[pad] ** 2 * self._used[pad]
         self.disturbance[pad] = self._earlier[pad] = 0.0
         self._update_channel_noise()
@@ -151,14 +163,18 @@ class Baseline:
         self.set_offset(pad, np.zeros(self._channels[pad]), std)
         self.known[pad] = False
 
-    def set_gravity(self, gravity: FloatArray) -> None:
-        """Set the unit direction of gravity in each link's frame (n, 3); NaN where unknown: the last one
-        holds."""
-        known = ~np.isnan(gravity[:, 0])
-        first = known & ~self.gravity.any(axis=1)
-        self.gravity[known] = gravity[known]
-        self.smoothed_gravity[first] = gravity[first]
+    def set_felt_gravity(self, felt: FloatArray) -> None:
+        """Set gravity less acceleration in each link's frame (n, 3), in units of gravity; NaN where unknown:
+        the last one holds."""
+        self.link_load.set_felt(felt)
         self._update_expected()
+        if np.count_nonzero(self.link_load.magnetic):
+            self._update_thresholds()
+
+    @property
+    def noise_factor(self) -> FloatArray:
+        """What hum and noise would raise thresholds by (n,); below 1, they don't."""
+        return np.asarray(_DISTURBANCE_MARGIN * (self.disturbance @ self._ones) / self._begin_threshold)
 
     @property
     def noise_counts(self) -> FloatArray:
@@ -185,7 +201,10 @@ class Baseline:
         # hum of which the samples above a threshold were left out
         whole = ~self._swings() | (self._count >= self._span_count)
         falls = whole & self._falls(mean, mean_std)
-        if np.count_nonzero(unknown := falls & sampled & ~touching & ~self.known):
+        self._follow_falls_in_touch()
+        self._end_drifted_contacts(sync_ns, elapsed_ns * 1e-9)
+        shifted = self.held & (mean < -_MAX_FALL_SIGMA * self._noise[:, None]).any(axis=1)
+        if np.count_nonzero(unknown := falls & sampled & ~touching & (~self.known | shifted)):
             self._learn_zeros(unknown, mean, mean_std)
             sampled &= ~unknown
         self._release_returned(sampled & whole & ~touching, total)
@@ -197,8 +216,9 @@ class Baseline:
         self._blocks[0] += 1
         if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
             self._update_noise(mean, free)
-        if np.count_nonzero(self.gravity):
-            self._update_gravity_slope(mean, free, dt_s)
+        limits = self._noise, self._begin_threshold, TRACKING_TIME_S
+        if (explained := self.link_load.learn(mean, free, dt_s, *limits)) is not None:
+            self.offset += explained
         self._update_expected()
         self._sum[:] = 0.0
         self._squares[:] = 0.0
@@ -224,8 +244,13 @@ class Baseline:
         np.copyto(self.disturbance, level, where=known[:, None])
         self._earlier[known, 0] = self._earlier[known, 1]
         self._earlier[known, 1] = now[known]
-        raised = _DISTURBANCE_MARGIN * (self.disturbance @ self._ones) / self._begin_threshold
-        np.maximum(raised, 1.0, out=self.threshold_factor)
+        self._update_thresholds()
+
+    def _update_thresholds(self) -> None:
+        """Raise the thresholds over hum and noise, and over what turns may do to magnetic pads."""
+        np.maximum(self.noise_factor, 1.0, out=self.threshold_factor)
+        if np.count_nonzero(self.link_load.magnetic):
+            self.threshold_factor += _TURN_SIGMA * self._turn_std() / self._begin_threshold
 
     def _swings(self) -> BoolArray:
         """Return the pads (n,) that cross their mean faster than a hand touches."""
@@ -247,6 +272,40 @@ class Baseline:
         self.unverified[learned], self.known[learned] = False, True
         self.held[learned] = False
 
+    def _follow_falls_in_touch(self) -> None:
+        """Lower the baseline of channels of touched pads that read less, as no contact lowers a channel. A
+        step isn't followed: see `stages.detect`."""
+        count = np.maximum(self._span_count, 1.0)[:, None]
+        mean, margin = self._span_sum / count, _CONFIDENCE_SIGMA * self._channel_noise / np.sqrt(count)
+        slow = (mean < -margin) & (mean > -_MAX_FALL_SIGMA * self._noise[:, None])
+        slow &= (self.touching & (self._span_count >= _MIN_VARIANCE_SAMPLES))[:, None]
+        if np.count_nonzero(slow):
+            step = (mean + margin) * slow
+            self.offset += step
+            self.std -= step @ self._ones
+
+    def _end_drifted_contacts(self, sync_ns: int, elapsed_s: float) -> None:
+        """Learn the zeros of touched pads that read what drift may have added since their contact began."""
+        count = np.maximum(self._span_count, 1.0)[:, None]
+        mean = self._span_sum / count
+        level = mean @ self._ones
+        np.copyto(self._peak_level, np.maximum(self._peak_level, level) * self.touching)
+        left = np.minimum(
+            self._max_rate * (sync_ns - self._begin_ns) * 1e-9, _MAX_LEFT_THRESHOLDS * self._begin_threshold
+        )
+        left = np.minimum(left, _MAX_LEFT_FRACTION * self._peak_level)
+        small = self.touching & (level < left) & (self._span_count >= _MIN_VARIANCE_SAMPLES)
+        if not np.count_nonzero(small):
+            self._still_s[:] = 0.0
+            return
+        variance = self._span_squares / count - np.square(mean)
+        still = (variance <= np.square(_QUIET_SIGMA * self._channel_noise)).all(axis=1)
+        still &= np.abs(level - self._span_level) <= _QUIET_SIGMA * self._root_channels * self._noise
+        self._still_s[:] = (self._still_s + elapsed_s) * (small & still)
+        drifted = self._still_s > _STILL_S
+        self.offset += mean * drifted[:, None]
+        self.std[drifted] = self._noise[drifted]
+
     def _may_be_contact(self, mean: FloatArray, mean_std: FloatArray) -> BoolArray:
         """Return the pads (n,) that a contact below the threshold may load: no channel has fallen, and they
         rise by different amounts."""
@@ -259,14 +318,14 @@ class Baseline:
 
     def _release_returned(self, sampled: BoolArray, total: FloatArray) -> None:
         """End the hold of pads that read nearly their baseline again."""
-        sum_std = np.hypot(self.std, self._root_channels * self._noise)
+        sum_std = self._sum_std()
         near = _MAX_RETURN_FRACTION * self._end_threshold + _CONFIDENCE_SIGMA * sum_std
         less = sampled & (total < -near) & (total >= -self._begin_threshold)
         if np.count_nonzero(less):
             self.unverified |= less
             self.held |= less  # until the next block: only a part of this one may be without the touch
             self.std[less] = self._begin_threshold[less] / _CONFIDENCE_SIGMA
-            sum_std = np.hypot(self.std, self._root_channels * self._noise)
+            sum_std = self._sum_std()
             sampled = sampled & ~less
         elif not np.count_nonzero(self.unverified) and not np.count_nonzero(self.held):
             return
@@ -287,6 +346,15 @@ class Baseline:
             self.std[first] = np.sqrt(gain * variance)
             self.unverified[first], self.known[first] = False, True
         self.held &= ~back
+
+    def _sum_std(self) -> FloatArray:
+        """Return the standard deviation (n,) of the sum of an untouched pad's channels."""
+        found = np.hypot(self.std, self._root_channels * self._noise)
+        return np.hypot(found, self._turn_std()) if np.count_nonzero(self.link_load.magnetic) else found
+
+    def _turn_std(self) -> FloatArray:
+        """Return the standard deviation (n,) of what turns do to the sum of magnetic pads' channels."""
+        return self.link_load.unknown_counts(self._begin_threshold) * self._channels
 
     def _track_offsets(
         self, mean: FloatArray, falls: BoolArray, free: BoolArray, dt_s: FloatArray
@@ -346,28 +414,17 @@ class Baseline:
         self._channel_noise = np.sqrt(np.maximum(self.noise_squared, stated))
         """(n, c) the larger of the stated and the measured standard deviation"""
 
-    def _update_gravity_slope(self, mean: FloatArray, free: BoolArray, dt_s: FloatArray) -> None:
-        """Update gravity slopes from the unexplained rest of offsets and the change of gravity (normalised
-        LMS); both are smoothed alike, so a constant offset isn't attributed to gravity."""
-        turn = self.gravity - self.smoothed_gravity
-        self.smoothed_gravity += turn * (-np.expm1(-dt_s / TRACKING_TIME_S) * free)[:, None]
-        gain = _GRAVITY_GAIN * free / (np.square(turn).sum(axis=1) + _MIN_TURN_SQUARED)
-        moved = (mean * gain[:, None])[:, :, None] * turn[:, None]
-        self.gravity_slope += moved
-        by_turn = np.matmul(moved, self.smoothed_gravity[:, :, None])[:, :, 0]
-        self.offset -= by_turn  # explained by gravity now
-
     def _discard_samples(self, pads: IntArray) -> None:
         self._sum[pads] = self._squares[pads] = 0.0
         self._count[pads] = 0.0
 
     def _update_expected(self) -> None:
         np.copyto(self.expected_counts, self.offset)
-        if np.count_nonzero(self.gravity):
-            self.expected_counts += np.matmul(self.gravity_slope, self.gravity[:, :, None])[:, :, 0]
+        if (load := self.link_load.expected_counts()) is not None:
+            self.expected_counts += load
 
-    def _set_limits(
-        self, noise: FloatArray, begin: FloatArray, end: FloatArray, max_rise_time_s: FloatArray
-    ) -> None:
-        self._noise, self._begin_threshold, self._end_threshold = noise, begin, end
+    def _set_limits(self, settings: BaselineSettings) -> None:
+        self._noise, self._begin_threshold, end, max_rise_time_s, magnetic = settings
+        self.link_load.magnetic[:] = magnetic
+        self._end_threshold = end
         self._max_rate = end / max_rise_time_s

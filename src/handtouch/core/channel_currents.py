@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from handtouch.field.contact_law import MIN_SPREADING_RATIO, ContactLaw
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 from handtouch.field.surface import Surface
 
 _POINTS = 25  # along each side
@@ -33,7 +33,7 @@ class ChannelCurrents:
 
     def __init__(
         self,
-        network: ElectrodeNetwork,
+        network: ChannelModel,
         surface: Surface,
         law: ContactLaw,
         drive_v: float,

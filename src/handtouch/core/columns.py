@@ -69,6 +69,8 @@ class PadColumns:
     """PositionStatus"""
     force_status: NDArray[np.uint8]
     """ForceStatus"""
+    contact_radius_status: NDArray[np.uint8]
+    """ContactRadiusStatus"""
 
     @classmethod
     def of_state(cls, state: TickState) -> PadColumns:
@@ -100,6 +102,7 @@ class PadColumns:
             published={**published, "total_current_a": np.zeros(n, np.float32)},
             position_status=np.zeros(len(values), dtype=np.uint8),
             force_status=np.zeros(len(values), dtype=np.uint8),
+            contact_radius_status=np.zeros(len(values), dtype=np.uint8),
         )
 
 

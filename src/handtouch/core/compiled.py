@@ -26,8 +26,25 @@ from types import ModuleType
 from typing import NamedTuple
 
 STAGES = (
-    *("tables", "tolerances", "locate", "pairs", "force", "solve", "slip", "receive", "detect", "sheets"),
-    *("kinematics", "groups", "frames", "publish", "shear", "evidence"),
+    "tables",
+    "tolerances",
+    "locate",
+    "elongation",
+    "pairs",
+    "receive",
+    "force",
+    "loads",
+    "two_sheets",
+    "solve",
+    "slip",
+    "detect",
+    "sheets",
+    "kinematics",
+    "groups",
+    "frames",
+    "publish",
+    "shear",
+    "evidence",
 )
 """Modules of `handtouch.core.stages`, lowest first."""
 SIMULATOR_STAGES = ("patches", "histories")

@@ -6,28 +6,45 @@ Public names: `make_solver`, `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`,
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import RowArray, view_memory, view_rows
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pad_tables import MAX_SQUARED_MISFIT, SEARCH_POINTS
-from handtouch.core.stages.force import stack_table
-from handtouch.core.stages.locate import Fit
-from handtouch.core.stages.pairs import PairFit, grid_points, work_size
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.solve import (
     MISFIT_COUNT,
+    MISFIT_ROW,
+    MOUNT_ROW,
     PART_COUNT,
+    PART_ROW,
     PART_SLICES,
     PARTS_COUNT,
     VALUE_COUNT,
+    VALUE_ROW,
     VALUE_SLICES,
     ContactSolver,
 )
-from handtouch.core.stages.tables import PadSurface, Placement
+from handtouch.core.stages.tables import PadSurface
 from handtouch.core.stages.tolerances import PartKnowledge
+from handtouch.core.stages.two_sheets import TwoSheets
 
 FloatArray = NDArray[np.float64]
+_MODEL_ARRAYS = (
+    "weight",
+    "gain_covariance",
+    "peak_currents_a",
+    "mounts",
+    "crowding",
+    "ampere_per_count",
+)
+"""Arrays that solver and model have by the same name"""
+_ROWS = {"values": VALUE_ROW, "parts": PART_ROW, "mounts": MOUNT_ROW, "misfits": MISFIT_ROW}
+"""Those of named numbers"""
 
 
 def make_solver(
@@ -37,55 +54,45 @@ def make_solver(
     force_requested: NDArray[np.bool_],
     values: FloatArray,
     parts: FloatArray | None = None,
-    saturated: NDArray[np.bool_] | None = None,
-    noise_squared: FloatArray | None = None,
-    misfits: FloatArray | None = None,
+    measured: Mapping[str, NDArray[Any]] = MappingProxyType({}),
+    both: TwoSheets | None = None,
 ) -> ContactSolver:
     """Return a solver of contacts that reads and writes these arrays in place.
 
     currents: (pads, channels) [A]. offset_std_a: (pads,) of the sum of the currents, from the baseline.
     force_requested: (pads,). values: (pads, VALUE_COUNT), laid out as VALUE_SLICES; NaN for new contacts.
-    parts: (pads, PARTS_COUNT), twice PART_SLICES. saturated: (pads, channels), lower bounds of currents.
-    noise_squared: (pads, channels), variances of the channels as measured [counts^2]. misfits: (pads, 3), see
-    `ContactSolver`.
+    parts: (pads, PARTS_COUNT), twice PART_SLICES. measured: by name, as far as known, `saturated` (pads,
+    channels), lower bounds of currents; `noise_squared` (pads, channels), variances of the channels as
+    measured [counts^2]; `misfits` (pads, 3), see `ContactSolver`. both: pads with two sheets.
     """
-    n, points = currents.shape[1], grid_points(SEARCH_POINTS)
     limits, moments = model.pair_settings()
-    if parts is None:
-        parts = np.full((model.size, PARTS_COUNT), np.nan)
-    if noise_squared is None:
-        noise_squared = np.zeros(currents.shape)
-    if misfits is None:
-        misfits = np.zeros((model.size, MISFIT_COUNT))
-    if saturated is None:
-        saturated = np.zeros(currents.shape, dtype=np.bool_)
+    arrays: dict[str, NDArray[Any]] = {
+        "currents": currents,
+        "offset_std_a": offset_std_a,
+        "force_requested": force_requested,
+        "values": values,
+        "parts": np.full((model.size, PARTS_COUNT), np.nan) if parts is None else parts,
+        "pair_limits": limits,
+        "moment_stds": moments,
+        "saturated": np.zeros(currents.shape, dtype=np.bool_),
+        "noise_squared": np.zeros(currents.shape),
+        "misfits": np.zeros((model.size, MISFIT_COUNT)),
+    }
+    arrays |= {name: getattr(model, name) for name in _MODEL_ARRAYS} | dict(measured)
     return ContactSolver(
-        model.stage_tables(),
-        model.stage_tolerances(),
-        model.stage_laws(),
-        [PadSurface(surface) for surface in model.surface_tables],
-        stack_table(),
-        Fit(n, int(model.state_counts.max())),
-        Placement(),
-        n,
-        _work(3 * n),
-        view_memory(currents),
-        view_memory(model.weight),
-        PartKnowledge(model.part_axes, model.part_axis_ends, model.part_offsets, model.touch_errors),
-        view_memory(model.gain_covariance),
-        view_memory(offset_std_a),
-        view_memory(force_requested),
-        view_memory(values),
-        PairFit(n, points, _work(work_size(n, points))),
-        *(view_memory(limits), view_memory(moments), view_memory(parts)),
-        *(view_memory(saturated), view_memory(model.peak_currents_a), view_memory(model.mounts)),
-        *(view_memory(model.crowding), view_memory(model.ampere_per_count), view_memory(noise_squared)),
-        view_memory(misfits),
+        models=model.stage_tables(),
+        pad_tolerances=model.stage_tolerances(),
+        laws=model.stage_laws(),
+        surfaces=[PadSurface(surface) for surface in model.surface_tables],
+        known=PartKnowledge(model.part_axes, model.part_axis_ends, model.part_offsets, model.touch_errors),
+        arrays={name: _view(name, array) for name, array in arrays.items()},
+        both=both,
     )
 
 
-def _work(size: int) -> memoryview[float]:
-    return view_memory(np.zeros(size))
+def _view(name: str, array: NDArray[Any]) -> memoryview[Any] | RowArray:
+    row = _ROWS.get(name)
+    return view_memory(array) if row is None else view_rows(array, row)
 
 
 __all__ = [

@@ -5,12 +5,13 @@ Public names: `ContactDetector`, `DetectionSettings`, `ContactChanges`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import RowArray, view_memory
+from handtouch.core.pad_model import PadModel
 from handtouch.core.stages.detect import ContactDetection
 from handtouch.core.state import TickState
 
@@ -32,11 +33,15 @@ class DetectionSettings(NamedTuple):
     """(n,) a contact begins above it"""
     end_threshold_a: FloatArray
     """(n,) a contact ends below it"""
-    begin_debounce_ns: NDArray[np.int64]
-    """(n,) a contact begins once all samples have been above `begin_threshold_a` for so long"""
-    end_debounce_ns: NDArray[np.int64]
-    max_gap_periods: NDArray[np.int64]
-    """(n,) a contact ends after so many missing samples"""
+    touch: RowArray
+    """(n,) TOUCH_ROWs"""
+    sample_delay_ns: NDArray[np.int64]
+    """(n,) from a sample to its SYNC, or to its arrival where it is event-driven"""
+
+    @classmethod
+    def of_model(cls, model: PadModel) -> DetectionSettings:
+        """Return those of a model, which has them by the same names."""
+        return cls(*(getattr(model, name) for name in cls._fields))
 
 
 class ContactChanges(NamedTuple):
@@ -69,20 +74,22 @@ class ContactDetector:
         self.currents, self.offset_std_a = np.zeros_like(expected_counts), np.zeros(state.pads)
         self.saturated = np.zeros(expected_counts.shape, dtype=np.bool_)
         self._state, self._expected_counts = state, expected_counts
-        self._rows = np.zeros((len(ContactChanges._fields), state.pads), dtype=np.intp)
-        self.lists = list(self._rows)
+        self.lists = [np.zeros(state.pads, np.intp) for _ in ContactChanges._fields]
         """pads of a tick's changes, as long as the numbers in `stage` say"""
         self.set_settings(settings)
 
     def set_settings(self, settings: DetectionSettings) -> None:
         """Change the settings; they apply to present contacts too."""
-        arrays = {name: view_memory(array) for name, array in settings._asdict().items()}
+        arrays: dict[str, Any] = {"touch": settings.touch}
+        arrays |= {name: view_memory(a) for name, a in settings._asdict().items() if name != "touch"}
         arrays["expected_counts"] = view_memory(self._expected_counts)
         arrays["currents"] = view_memory(self.currents)
         arrays["saturated"] = view_memory(self.saturated)
         arrays["excess"] = view_memory(np.zeros(self._state.channels))
         arrays["offset_std_a"] = view_memory(self.offset_std_a)
-        self.stage = ContactDetection(self._state.pads, self._state.memory | arrays, view_memory(self._rows))
+        self.stage = ContactDetection(
+            self._state.pads, self._state.memory | arrays, [view_memory(pads) for pads in self.lists]
+        )
 
     @property
     def begun_count(self) -> int:

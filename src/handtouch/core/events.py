@@ -49,18 +49,21 @@ class BaselineEvent:
     """Offsets (n,) of a pad and their standard deviations [counts]: a tare, or from a calibration.
 
     shear_counts: (4,) of the shear pad beneath it at rest; () leaves its rest position as it is.
-    """
+    second_counts: offset of its second sheet's channel and standard deviation; () leaves it as it is."""
 
     kind: ClassVar[str] = "baseline"
     pad: int
     offset_counts: tuple[float, ...]
     std_counts: tuple[float, ...]
     shear_counts: tuple[float, ...] = ()
+    second_counts: tuple[float, ...] = ()
 
     def apply(self, target: EventTarget) -> None:
         target.tick.set_baseline(self.pad, self.offset_counts, self.std_counts)
         if self.shear_counts:
             target.tick.shear.set_rest(self.pad, self.shear_counts)
+        if self.second_counts:
+            target.tick.second.set_offset(self.pad, *self.second_counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +135,7 @@ class ExcitationEvent:
 
     def apply(self, target: EventTarget) -> None:
         target.tick.sheet_force.set_excitation(np.array(self.on))
+        target.tick.second.set_excitation(np.array(self.on))
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,13 +186,13 @@ class SamplingEvent:
 
 @dataclass(frozen=True, slots=True)
 class GravityEvent:
-    """Unit direction of gravity in each link's frame (n, 3), NaN where unknown."""
+    """Gravity less acceleration in each link's frame (n, 3), in units of gravity, NaN where unknown."""
 
     kind: ClassVar[str] = "gravity"
-    directions: tuple[tuple[float, float, float], ...]
+    felt: tuple[tuple[float, float, float], ...]
 
     def apply(self, target: EventTarget) -> None:
-        target.tick.baseline.set_gravity(np.array(self.directions))
+        target.tick.baseline.set_felt_gravity(np.array(self.felt))
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +215,17 @@ class ForceEvent:
 _EVENTS: dict[str, type[Any]] = {
     event.kind: event
     for event in (
-        *(BaselineEvent, CalibrationEvent, EvidenceEvent, ReplacementEvent, BackForceEvent, ModelEvent),
-        *(ExcitationEvent, DemandEvent, SamplingEvent, GravityEvent, ForceEvent),
+        BaselineEvent,
+        CalibrationEvent,
+        EvidenceEvent,
+        ReplacementEvent,
+        BackForceEvent,
+        ModelEvent,
+        ExcitationEvent,
+        DemandEvent,
+        SamplingEvent,
+        GravityEvent,
+        ForceEvent,
     )
 }
 

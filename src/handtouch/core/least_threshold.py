@@ -30,12 +30,12 @@ _SETTLING_NS = 10_000_000_000
 """Time after a contact in which a sheet's remaining current isn't noise: the baseline's time constant."""
 
 
-def begin_samples(begin_debounce_ns: int, period_ns: int) -> int:
+def begin_samples(begin_ms: float, period_ns: int) -> int:
     """Return how many samples in a row begin a contact: half a period less than the debounce is enough, and
     no debounce needs one."""
-    if begin_debounce_ns <= 0:
+    if begin_ms <= 0:
         return 1
-    return max(2, 1 + math.ceil((begin_debounce_ns - period_ns / 2) / period_ns))
+    return max(2, 1 + math.ceil((round(1e6 * begin_ms) - period_ns / 2) / period_ns))
 
 
 def least_begin_counts(scatter_counts: float, samples_per_s: float) -> float:
@@ -55,12 +55,11 @@ def level_scatter(levels: FloatArray, samples: int) -> float:
 class LevelScatter:
     """Standard deviations of the levels of n untouched pads, by block after block of samples.
 
-    begin_debounce_ns: (n,) of their contacts.
+    begin_ms: (n,) debounce of their contacts.
     """
 
-    def __init__(self, begin_debounce_ns: Sequence[int]) -> None:
-        self._debounce_ns = list(begin_debounce_ns)
-        n = len(self._debounce_ns)
+    def __init__(self, begin_ms: Sequence[float]) -> None:
+        self._begin_ms, n = list(begin_ms), len(begin_ms)
         self._squares, self._seconds = np.zeros(n), np.zeros(n)
         self._usable_from_ns = np.zeros(n, np.int64)
         self._last_ns, self._period_ns = 0, 0.0
@@ -118,7 +117,7 @@ class LevelScatter:
     def _set_period(self, period_ns: float) -> None:
         """Set how many samples begin a contact at this period of ticks."""
         self._period_ns = period_ns
-        self._samples[:] = [begin_samples(debounce, round(period_ns)) for debounce in self._debounce_ns]
+        self._samples[:] = [begin_samples(begin_ms, round(period_ns)) for begin_ms in self._begin_ms]
 
 
 def _running_means(levels: FloatArray, samples: int) -> FloatArray:

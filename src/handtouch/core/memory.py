@@ -1,17 +1,22 @@
 """Memory of arrays as the stages take it: flat memoryviews, which Python reads as its own numbers, and rows
 of named numbers.
 
-Public names: `view_memory`, `view_rows`, `slices_of`, `row_count`, `RowArray`.
+Public names: `view_memory`, `view_rows`, `rows_at`, `rows_by_name`, `number_row`, `slices_of`, `row_count`,
+`RowArray`.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable
+from types import NoneType
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 RowArray = np.recarray[tuple[int], np.dtype[np.void]]
+_NUMBERS = {float, int, bool, NoneType}
 _SIZE = 8
 """Bytes of a number"""
 
@@ -30,6 +35,27 @@ def view_memory(array: NDArray[Any]) -> memoryview[Any]:
 def view_rows(array: NDArray[Any], row: np.dtype[np.void]) -> RowArray:
     """Return the memory of an array as rows (k,) of named numbers."""
     return array.reshape(-1).view(row).view(np.recarray)
+
+
+def rows_at(rows: RowArray, number: int) -> RowArray:
+    """Return one of the rows, as rows (1,) in the same memory."""
+    return rows[number : number + 1].view(np.recarray)
+
+
+def number_row(table: type[BaseModel]) -> np.dtype[np.void]:
+    """Return the row of all keys of a table that are numbers; one that isn't given is NaN in it."""
+    found = []
+    for name, key in table.model_fields.items():
+        kinds = get_args(key.annotation) or (key.annotation,)
+        if {get_args(kind)[0] if get_args(kind) else kind for kind in kinds} <= _NUMBERS:
+            found.append((name, "<f8"))
+    return np.dtype(found)
+
+
+def rows_by_name(row: np.dtype[np.void], items: Iterable[object]) -> RowArray:
+    """Return rows (k,) filled with the attributes of k objects of the same names."""
+    names = row.names or ()
+    return np.array([tuple(getattr(item, name) for name in names) for item in items], row).view(np.recarray)
 
 
 def slices_of(row: np.dtype[np.void]) -> dict[str, slice]:

@@ -16,26 +16,29 @@ from handtouch.config import Deployment
 from handtouch.config.channels import (
     node_channels,
     order_by_electrode,
-    shear_numbers,
 )
+from handtouch.config.roles import CHANNEL_ROLES, SECOND_SHEET, SHEAR, channel_numbers
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.channel_currents import ChannelCurrents
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import RowArray, number_row, rows_at, rows_by_name, view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
-from handtouch.core.shear import shear_parameters
+from handtouch.core.shear_pads import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
-from handtouch.core.stages.force import LAW_PARAMETERS, PadLaw
+from handtouch.core.stages.force import LAW_ROW, PadLaw
 from handtouch.core.stages.locate import ModelTable
+from handtouch.core.stages.rows import TOUCH_ROW
 from handtouch.core.stages.tolerances import PadTolerances, part_count, shape_error
+from handtouch.field.channel_map import ChannelMap
 from handtouch.field.contact_law import ContactLaw
 from handtouch.field.contact_stack import stack_factor
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 from handtouch.hand import (
     MountUncertainty,
     PadGeometry,
+    channel_gain_std,
     mount_transform,
     network_parameters,
-    pad_network,
+    pad_channels,
     pad_surface,
 )
 from handtouch.hand.pads import sheet_law
@@ -49,6 +52,7 @@ _SHEET_TOLERANCES = {
 }
 
 
+_NODE_KEYS, _SHEET_KEYS = number_row(config.Node), number_row(config.Sheet)
 _UNEVEN_FACTOR = 1 / 3
 """Relative standard deviation of a layer's resistance over `contact_tilt_std`: even, Hertz's, tilted, annular
 and two-spot pressures, weighted alike, have 0.1 where the layer dominates and twice that where the sheet
@@ -76,13 +80,12 @@ class PadModel:
     `part_offsets` (n, p) and `touch_errors` (n,): see `PartKnowledge`; `quarantined` (n,): no force is
     published; `position_unreliable` (n,).
 
-    A contact begins at `begin_threshold_n` and ends at `end_threshold_n` [N]; `begin_threshold_a`,
-    `end_threshold_a` [A] are the corresponding total currents at the centre of the pad. `begin_debounce_ns`,
-    `end_debounce_ns`: times above and below them; `max_gap_periods`: missing samples that a contact survives.
-    `max_rise_time_s`: a slower rise to `end_threshold_n` is drift. `behaviours` (n,): sheet behaviour, None
-    where it isn't modelled.
+    `begin_threshold_a`, `end_threshold_a` [A] are the total currents at the centre of the pad at which a
+    contact begins and ends. `sample_delay_ns` (n,): from a sample to its SYNC. `behaviours` (n,): sheet
+    behaviour, None where it isn't modelled.
 
-    `crowding` (n,): pads on which currents crowd towards electrodes.
+    `magnetic` (n,): pads whose zeros shift as they turn. `crowding` (n,): pads on which currents crowd
+    towards electrodes.
     `mounts` (n, MOUNT_COUNT): origins of the pads on their links, and their variances, see `ContactSolver`.
     `peak_currents_a` (n,): largest current of an electrode by a contact of the sheet's `max_force_n`.
 
@@ -94,50 +97,92 @@ class PadModel:
     def __init__(
         self,
         deployment: Deployment,
-        forward_table: Callable[[ElectrodeNetwork], ForwardTable] = ForwardTable.from_network,
+        forward_table: Callable[[ChannelModel], ForwardTable] = ForwardTable.from_network,
     ) -> None:
         """Compute the parameters; `forward_table` returns that of a pad's network, once per distinct one."""
         entries = deployment.pads
         pads = [pad for _, pad in entries]
         nodes = [deployment.nodes[pad.node] for pad in pads]
-        sheets = [deployment.sheets[pad.sheet] for pad in pads]
-        touches = [pad.touch or deployment.touch for pad in pads]
+        sheets = [deployment.sheet_of(pad) for pad in pads]
+        self._parts = list(zip(pads, nodes, sheets, strict=True))
+        self.node_keys, self.sheet_keys = rows_by_name(_NODE_KEYS, nodes), rows_by_name(_SHEET_KEYS, sheets)
+        """(n,) numbers of each pad's node and sheet, by the names of the deployment's keys"""
         self.size = len(pads)
         self.hands = [hand for hand, _ in entries]
         self.links = [pad.link for pad in pads]
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
+        self.mounts = np.concatenate([_mounts_of(hand) for hand in deployment.hands])
+        self.surface_tables = [
+            SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
+        ]
+        self._set_channels(deployment)
+        self.networks = networks = networks_of(deployment)
+        tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
+        self.forward_tables = [tables[id(network)] for network in networks]
+        self._whole_tables = list(self.forward_tables)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
-        kinds = {name: node_channels(node) for name, node in deployment.nodes.items()}
+        self.calibrations = [self.default_calibration(pad) for pad in range(self.size)]
+        self.quarantined = np.zeros(self.size, dtype=np.bool_)
+        self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
+        self._set_stated_parts()
+        kinds_of_sheet = {name: _behaviour_of_sheet(sheet, name) for name, sheet in deployment.sheets.items()}
+        self.behaviours = [kinds_of_sheet.get(pad.sheet) if not pad.response else None for pad in pads]
+        self.magnetic = np.array([pad.is_magnetic for pad in pads])
+        self.crowding = self.sheet_keys.crowding > 0
+        self._set_stated_laws()
+        self._set_second_sheets(deployment)
+        self.touch = rows_by_name(TOUCH_ROW, [deployment.touch_of(pad) for pad in pads])
+        """(n,) thresholds by the names of `[touch]`"""
+        self.begin_threshold_a, self.end_threshold_a = (
+            np.array([self.centre_current(pad, force[pad]) for pad in range(self.size)])
+            for force in (self.touch.begin_threshold_n, self.touch.end_threshold_n)
+        )
+
+    def _set_channels(self, deployment: Deployment) -> None:
+        """Set the columns of channels: electrodes, their gains and noise, and what else is in the slab."""
+        pads, nodes = [pad for pad, _, _ in self._parts], [node for _, node, _ in self._parts]
         self.electrodes = [pad.electrode_names for pad in pads]
         self.electrode_counts = np.array([len(names) for names in self.electrodes])
         self.channels = int(self.electrode_counts.max())
-        self.calibrations = [self.default_calibration(pad) for pad in range(self.size)]
         self._used = np.arange(self.channels) < self.electrode_counts[:, None]
         self.ampere_per_count = np.zeros((self.size, self.channels))
         self.ampere_per_count[self._used] = np.concatenate(
             [ampere_per_count_of(pad, deployment) for pad in pads]
         )
+        self._nominal_a = self.ampere_per_count.copy()
+        self.gains = self._used.astype(np.float64)
+        self.mean_ampere_per_count = self.ampere_per_count.sum(axis=1) / self.electrode_counts
         self.noise_counts = np.array([noise_counts_of(node) for node in nodes])
         self.noise_a = self.noise_counts[:, None] * self.ampere_per_count
         self.weight = np.zeros(self.noise_a.shape)
         self.weight[self._used] = 1 / self.noise_a[self._used]
-        self.mean_ampere_per_count = self.ampere_per_count.sum(axis=1) / self.electrode_counts
-        shear = [range(self.channels, self.channels + len(shear_numbers(pad))) for pad in pads]
-        self.slab_channels = self.channels + max(map(len, shear))
-        self.slab_columns = [(*range(k), *own) for k, own in zip(self.electrode_counts, shear, strict=True)]
-        self.shear_pads = shear_parameters(deployment, self.channels, self.noise_counts)
+        kinds = {name: node_channels(node) for name, node in deployment.nodes.items()}
         self.max_counts = np.array([min(c.limits[1] for c in kinds[pad.node]) for pad in pads])
-        self._nominal_a = self.ampere_per_count.copy()
-        self.gains = self._used.astype(np.float64)
+        self.sample_delay_ns = np.rint(self.node_keys.sample_delay_ms * 1e6).astype(np.int64)
         self.state_counts = np.array([pad.state_count for pad in pads])
+        columns = _role_columns(pads)
+        self.slab_channels = max(of_role[-1] + 1 for own in columns for of_role in own.values() if of_role)
+        self.slab_columns = [tuple(c for of_role in own.values() for c in of_role) for own in columns]
+        first_of_shear = next((own[SHEAR][0] for own in columns if own[SHEAR]), 0)
+        self.shear_pads = shear_parameters(deployment, first_of_shear, self.noise_counts)
+        self.second_pads = np.array([row for row, pad in enumerate(pads) if pad.second_sheet], np.int64)
+        """(m,) rows of the pads with two sheets"""
+        self.second_columns = np.array([columns[row][SECOND_SHEET][0] for row in self.second_pads], np.int64)
+        """(m,) columns of their second sheets in the slab"""
+
+    def _set_stated_parts(self) -> None:
+        """Set what the deployment states of gains and other parts."""
         self._stated_gain_covariance = np.stack(
             [
-                node.gain_std**2 * _shared_channels(pad, self.channels)
-                for node, pad in zip(nodes, pads, strict=True)
+                channel_gain_std(pad, node) ** 2 * _shared_channels(pad, self.channels)
+                for pad, node, _ in self._parts
             ]
         )
         self.gain_covariance = self._stated_gain_covariance.copy()
+        self._stated_touch_errors = np.array(
+            [one.touch_error if isinstance(one, ChannelMap) else 0.0 for one in self.networks]
+        )
         self.touch_errors = np.zeros(self.size)
         parts = part_count(self.channels)
         self.part_offsets = np.zeros((self.size, parts))
@@ -145,46 +190,84 @@ class PadModel:
         self.part_axis_ends: NDArray[np.intp] = np.zeros((self.size, self.channels + parts), dtype=np.intp)
         for pad in range(self.size):
             self._set_parts(pad, None)
-        self.quarantined = np.zeros(self.size, dtype=np.bool_)
-        self.position_unreliable = np.zeros(self.size, dtype=np.bool_)
-        self.begin_threshold_n = np.array([touch.begin_threshold_n for touch in touches])
-        self.end_threshold_n = np.array([touch.end_threshold_n for touch in touches])
-        self.begin_debounce_ns = np.array([round(1e6 * touch.begin_ms) for touch in touches])
-        self.end_debounce_ns = np.array([round(1e6 * touch.end_ms) for touch in touches])
-        self.max_gap_periods = np.array([touch.max_gap_periods for touch in touches])
-        self.max_rise_time_s = np.array([touch.max_rise_time_s for touch in touches])
-        kinds_of_sheet = {name: _behaviour_of_sheet(sheet, name) for name, sheet in deployment.sheets.items()}
-        self.behaviours = [kinds_of_sheet[pad.sheet] for pad in pads]
-        networks = networks_of(deployment)
-        self.networks = networks
-        tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
-        self.forward_tables = [tables[id(network)] for network in networks]
-        self._whole_tables = list(self.forward_tables)
-        self._parts = list(zip(pads, nodes, sheets, strict=True))
-        self.surface_tables = [
-            SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
-        ]
-        self.mounts = np.concatenate([_mounts_of(hand) for hand in deployment.hands])
-        self.crowding = np.array([sheet.crowding for sheet in sheets])
-        self._drive_v = np.array([node.drive_v for node in nodes])
-        self._file_laws = [law_of(sheet) for sheet in sheets]
-        self._sheet_ohm = np.array([sheet.ohm_per_square for sheet in sheets])
+
+    def _set_stated_laws(self) -> None:
+        """Set the contact laws of the deployment, and contacts at the centres of the pads."""
+        sheets = [sheet for _, _, sheet in self._parts]
+        self._sheet_ohm = self.sheet_keys.ohm_per_square.copy()
+        self._has_series = np.array([any(pad.series_ohm) for pad, _, _ in self._parts])
         self._series_form = np.zeros((self.size, self.channels, self.channels))
-        for form, network in zip(self._series_form, networks, strict=True):
+        for form, network in zip(self._series_form, self.networks, strict=True):
             count = len(network.series_ohm)
             form[:count, :count] = network.series_quadratic_form
-        self._has_series = np.array([any(pad.series_ohm) for pad in pads])
+        self._file_laws = [law_of(sheet) for sheet in sheets]
         self._laws = [contact_law(sheet, law) for sheet, law in zip(sheets, self._file_laws, strict=True)]
-        self.law_parameters = np.zeros((self.size, LAW_PARAMETERS))
-        """(n, LAW_PARAMETERS), see `PadLaw`"""
+        self.law_parameters: RowArray = np.zeros(self.size, LAW_ROW).view(np.recarray)
+        """(n,) LAW_ROWs"""
         for pad in range(self.size):
             self._update_law_parameters(pad)
-        self.peak_currents_a = self._peak_currents(networks)
-        self._centre_spreading = self._spreading_at_centre(networks)
-        self.begin_threshold_a, self.end_threshold_a = (
-            np.array([self.centre_current(pad, force[pad]) for pad in range(self.size)])
-            for force in (self.begin_threshold_n, self.end_threshold_n)
+        self.peak_currents_a = self._peak_currents()
+        self._centre_contacts = self._contacts_at_centre()
+
+    def _set_second_sheets(self, deployment: Deployment) -> None:
+        """Compute the parameters of the second sheets (m,), as those of the pads."""
+        pads = [self._parts[row][0] for row in self.second_pads]
+        nodes = [self._parts[row][1] for row in self.second_pads]
+        sheets = [deployment.sheets[pad.second_sheet or ""] for pad in pads]
+        numbers = [channel_numbers(pad, SECOND_SHEET)[0] for pad in pads]
+        self.second_ampere_per_count = np.array(
+            [channel_ampere_per_count(node, number) for node, number in zip(nodes, numbers, strict=True)]
         )
+        self.second_behaviours = [
+            _behaviour_of_sheet(sheet, pad.second_sheet or "")
+            for sheet, pad in zip(sheets, pads, strict=True)
+        ]
+        self._second_parts = list(zip(sheets, [law_of(sheet) for sheet in sheets], strict=True))
+        self.second_law_parameters: RowArray = np.zeros(len(pads), LAW_ROW).view(np.recarray)
+        """(m,) LAW_ROWs"""
+        for row in self.second_pads.tolist():
+            self._update_second_law(row)
+
+    def default_second_law(self, pad: int) -> LawParameters | None:
+        """Return the deployment's contact law of a pad's second sheet, None without one."""
+        if pad not in self.second_pads:
+            return None
+        return self._second_parts[self.second_pads.searchsorted(pad)][1]
+
+    def _update_second_law(self, pad: int) -> None:
+        """Write the law of a pad's second sheet as the stages take it.
+
+        While it isn't measured, the error of the channel's gain is one of the sheet's resistance: both
+        multiply the current.
+        """
+        number, measured = self.second_pads.searchsorted(pad), self.calibrations[pad].second_law
+        sheet, law = self._second_parts[number]
+        if measured is not None:
+            law = measured
+        else:
+            covariance = np.array(law.covariance)
+            covariance[np.ix_([0, 2], [0, 2])] += self._parts[pad][1].gain_std ** 2
+            law = replace(law, covariance=matrix(covariance))
+        _write_law(self.second_law_parameters[number], law, sheet, float(self.node_keys.drive_v[pad]))
+
+    def second_threshold_counts(self) -> tuple[FloatArray, FloatArray]:
+        """Return the counts (m,) of the second sheets at which contacts begin and end."""
+        counts = []
+        for forces in (self.touch.begin_threshold_n, self.touch.end_threshold_n):
+            currents = [
+                float(
+                    contact_law(sheet, law).current(
+                        forces[row],
+                        self.node_keys.drive_v[row],
+                        law.ohm_per_square,
+                        self._centre_contacts[0][row],
+                        0.0,
+                    )
+                )
+                for row, (sheet, law) in zip(self.second_pads, self._second_parts, strict=True)
+            ]
+            counts.append(np.array(currents) / self.second_ampere_per_count)
+        return counts[0], counts[1]
 
     def default_calibration(self, pad: int) -> ActiveCalibration:
         """Return the calibration of a pad without one: the deployment's."""
@@ -196,6 +279,8 @@ class PadModel:
         before, self.calibrations[pad] = self.calibrations[pad], calibration
         if calibration.law != before.law:
             self._set_law(pad, calibration.law)
+        if calibration.second_law != before.second_law and pad in self.second_pads:
+            self._update_second_law(pad)
         count = self.electrode_counts[pad]
         self.gains[pad, :count] = calibration.gains
         self.ampere_per_count[pad] = self._nominal_a[pad] * self.gains[pad]
@@ -233,13 +318,14 @@ class PadModel:
         """Apply what is known of the parts of a pad, None: as the deployment states, and of its gains."""
         count = int(self.electrode_counts[pad])
         size = count + part_count(count)
-        self.part_offsets[pad] = self.touch_errors[pad] = 0.0
+        self.part_offsets[pad], self.touch_errors[pad] = 0.0, self._stated_touch_errors[pad]
         if parts is not None:
             axes = _triangle(np.array(parts.covariance))
             self.part_offsets[pad, : size - count] = parts.offsets
             # scores of contacts that aren't round, which the sheet states already, are among those measured
-            stated = shape_error(*self._parts[pad][::2], self._whole_tables[pad])
-            self.touch_errors[pad] = math.sqrt(max(parts.touch_error**2 - stated**2, 0.0))
+            stated = shape_error(*self._parts[pad][::2], self.networks[pad], self._whole_tables[pad])
+            learned = math.sqrt(max(parts.touch_error**2 - stated**2, 0.0))
+            self.touch_errors[pad] = max(learned, self._stated_touch_errors[pad])
         else:
             axes = np.eye(size)
             axes[:count, :count] = _triangle(self.gain_covariance[pad, :count, :count])
@@ -296,31 +382,13 @@ class PadModel:
         self._sheet_ohm[pad] = applied.ohm_per_square
         self._laws[pad] = contact_law(self._parts[pad][2], applied)
         self._update_law_parameters(pad)
-        self.begin_threshold_a[pad] = self.centre_current(pad, self.begin_threshold_n[pad])
-        self.end_threshold_a[pad] = self.centre_current(pad, self.end_threshold_n[pad])
+        self.begin_threshold_a[pad] = self.centre_current(pad, self.touch.begin_threshold_n[pad])
+        self.end_threshold_a[pad] = self.centre_current(pad, self.touch.end_threshold_n[pad])
 
     def _update_law_parameters(self, pad: int) -> None:
         """Write the law of a pad as the stages take it."""
-        law, sheet = self.law(pad), self._parts[pad][2]
-        alpha, greatest_n = law.alpha, sheet.max_force_n
-        log_radius, radius_variance = _log_radius(
-            sheet.contact_radius_mm * 1e-3, sheet.contact_radius_std_mm * 1e-3
-        )
-        power, growth = 1 / alpha, 0.0
-        if law.hertz_force_n is not None:
-            power, growth = 3 / (2 + alpha), 1 / (2 + alpha)
-            log_radius -= math.log(law.hertz_force_n) / 3
-        log_sheet = math.log(law.ohm_per_square)
-        log_reference_n = math.log(math.pi * sheet.reference_kpa * 1e3) + 2 * log_radius
-        # x^2 = A^2 rho / sigma, here at 1 N
-        log_x2 = log_sheet + 2 * log_radius - math.log(law.contact_ohm_mm2 * 1e-6) - alpha * log_reference_n
-        log_max_x2 = log_x2 + math.log(greatest_n) / power if greatest_n else math.inf
-        self.law_parameters[pad] = (
-            *(log_x2, power, 2 - 2 * alpha, log_radius, radius_variance, log_sheet, self._drive_v[pad]),
-            *(log_x2 * (power - 2 * growth) + log_reference_n, *np.array(law.covariance)[np.triu_indices(3)]),
-            *(log_max_x2, float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0, growth),
-            _UNEVEN_FACTOR * sheet.contact_tilt_std,
-        )
+        drive_v, sheet = float(self.node_keys.drive_v[pad]), self._parts[pad][2]
+        _write_law(self.law_parameters[pad], self.law(pad), sheet, drive_v)
 
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""
@@ -329,8 +397,8 @@ class PadModel:
 
     def stage_tables(self) -> list[ModelTable]:
         """Return the forward models as the stages take them."""
-        pads = zip(self.forward_tables, self.state_counts.tolist(), strict=True)
-        return [ModelTable(table, states) for table, states in pads]
+        pads = zip(self.forward_tables, self.state_counts.tolist(), self.networks, strict=True)
+        return [ModelTable(table, states, network.is_potential) for table, states, network in pads]
 
     def pair_settings(self) -> FloatArray:
         """Return the limit (n,) of one contact's squared misfit beyond which two are tried, and the deviation
@@ -351,33 +419,37 @@ class PadModel:
         """Return the contact laws as the stages take them; they follow later changes."""
         return [
             PadLaw(
-                view_memory(parameters),
+                rows_at(self.law_parameters, pad),
                 view_memory(np.ascontiguousarray(form[:count, :count])),
                 bool(has_series),
             )
-            for parameters, form, count, has_series in zip(
-                *(self.law_parameters, self._series_form, self.electrode_counts, self._has_series),
-                strict=True,
+            for pad, (form, count, has_series) in enumerate(
+                zip(self._series_form, self.electrode_counts, self._has_series, strict=True)
             )
         ]
 
-    def _peak_currents(self, networks: Sequence[ElectrodeNetwork]) -> FloatArray:
+    def _peak_currents(self) -> FloatArray:
         """Return the largest current of an electrode by the firmest contact of the deployment (n,) [A]."""
         known: dict[tuple[object, ...], float] = {}
         currents = []
-        for (pad, node, sheet), network in zip(self._parts, networks, strict=True):
+        for (pad, node, sheet), network in zip(self._parts, self.networks, strict=True):
             key = pad.surface, id(network), pad.sheet, pad.node
             if key not in known:
                 places = ChannelCurrents(
-                    *(network, pad_surface(pad), contact_law(sheet, law_of(sheet)), node.drive_v),
+                    network,
+                    pad_surface(pad),
+                    contact_law(sheet, law_of(sheet)),
+                    node.drive_v,
                     sheet.ohm_per_square,
                 )
                 known[key] = places.peak(sheet.max_force_n or _UNLIMITED_FORCE_N).current_a
             currents.append(known[key])
         return np.array(currents)
 
-    def _spreading_at_centre(self, networks: Sequence[ElectrodeNetwork]) -> tuple[FloatArray, FloatArray]:
-        """Return spreading radius [m] and series resistance [ohm] at the centre of each pad."""
+    def _contacts_at_centre(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return spreading radius [m], series resistance [ohm] and sum of the fractions at the centre of each
+        pad."""
+        networks = self.networks
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
         placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad, _, _ in self._parts])
@@ -387,21 +459,48 @@ class PadModel:
         fractions.T[self._used] = np.concatenate(
             [net.fractions(*at) for net, *at in zip(networks, x, y, strict=True)]
         )
-        return radius * scale, self._series_resistance(pads, fractions)
+        is_sheet = [network.is_potential for network in networks]
+        sums = np.where(is_sheet, 1.0, fractions.sum(axis=0))
+        return radius * scale, self._series_resistance(pads, fractions), sums
 
     def centre_current(self, pad: int, force_n: float) -> float:
-        """Return the total current of a contact of that force at the centre of a pad."""
-        spreading_m, series_ohm = (values[pad] for values in self._centre_spreading)
-        drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]
-        return float(self._laws[pad].current(force_n, drive_v, sheet_ohm, spreading_m, series_ohm))
+        """Return the sum of the currents of a contact of that force at the centre of a pad."""
+        spreading_m, series_ohm, share = (values[pad] for values in self._centre_contacts)
+        drive_v, sheet_ohm = self.node_keys.drive_v[pad], self._sheet_ohm[pad]
+        return float(share * self._laws[pad].current(force_n, drive_v, sheet_ohm, spreading_m, series_ohm))
 
     def centre_force(self, pad: int, counts: float) -> float:
         """Return the force of a contact at the centre of a pad by the sum of its channels."""
-        current_a = counts * self.mean_ampere_per_count[pad]
-        spreading_m, series_ohm = (values[pad] for values in self._centre_spreading)
-        drive_v, sheet_ohm = self._drive_v[pad], self._sheet_ohm[pad]
+        spreading_m, series_ohm, share = (values[pad] for values in self._centre_contacts)
+        current_a = counts * self.mean_ampere_per_count[pad] / share
+        drive_v, sheet_ohm = self.node_keys.drive_v[pad], self._sheet_ohm[pad]
         estimate = self._laws[pad].force(current_a, drive_v, sheet_ohm, spreading_m, series_ohm)
         return float(estimate.force_n)
+
+
+def _write_law(row: np.record, law: LawParameters, sheet: config.Sheet, drive_v: float) -> None:
+    """Write a sheet's law to a LAW_ROW."""
+    alpha, greatest_n = law.alpha, sheet.max_force_n
+    log_radius, radius_variance = _log_radius(
+        sheet.contact_radius_mm * 1e-3, sheet.contact_radius_std_mm * 1e-3
+    )
+    power, growth = 1 / alpha, 0.0
+    if law.hertz_force_n is not None:
+        power, growth = 3 / (2 + alpha), 1 / (2 + alpha)
+        log_radius -= math.log(law.hertz_force_n) / 3
+    log_sheet = math.log(law.ohm_per_square)
+    log_reference_n = math.log(math.pi * sheet.reference_kpa * 1e3) + 2 * log_radius
+    # x^2 = A^2 rho / sigma, here at 1 N
+    log_x2 = log_sheet + 2 * log_radius - math.log(law.contact_ohm_mm2 * 1e-6) - alpha * log_reference_n
+    log_max_x2 = log_x2 + math.log(greatest_n) / power if greatest_n else math.inf
+    row.log_x2, row.power, row.by_radius = log_x2, power, 2 - 2 * alpha
+    row.log_radius, row.radius_variance = log_radius, radius_variance
+    row.log_sheet, row.drive_v = log_sheet, drive_v
+    row.log_reference = log_x2 * (power - 2 * growth) + log_reference_n
+    row.covariance[:] = np.array(law.covariance)[np.triu_indices(3)]
+    row.max_log_x2 = log_max_x2
+    row.min_factor = float(stack_factor(np.exp(0.5 * log_max_x2))) if greatest_n else 0.0
+    row.growth, row.uneven = growth, _UNEVEN_FACTOR * sheet.contact_tilt_std
 
 
 def _log_radius(radius: float, std: float) -> tuple[float, float]:
@@ -429,7 +528,10 @@ def _triangle(covariance: FloatArray) -> FloatArray:
 
 
 def _behaviour_of_sheet(sheet: config.Sheet, name: str) -> SheetBehaviour | None:
-    return sheet_behaviour_of(sheet.behaviour, name) if sheet.behaviour else None
+    if not sheet.behaviour:
+        return None
+    behaviour = sheet_behaviour_of(sheet.behaviour, name)
+    return replace(behaviour, max_force_n=sheet.max_force_n or math.inf)
 
 
 def noise_counts_of(node: config.Node) -> float:
@@ -451,6 +553,23 @@ def ampere_per_count_of(pad: config.Pad, deployment: Deployment) -> list[float]:
     ]
 
 
+def channel_ampere_per_count(node: config.Node, number: int) -> float:
+    """Return the current per count of a channel of a node, without any calibration."""
+    most = node.full_scale_counts or node_channels(node)[number].limits[1]
+    return node.full_scale_ma * 1e-3 / most * node.channel_scale[number]
+
+
+def _role_columns(pads: Sequence[config.Pad]) -> list[dict[str, range]]:
+    """Return the columns of each pad's channels by role: those of one role are the same ones in all pads."""
+    first, columns = 0, [dict[str, range]() for _ in pads]
+    for role in CHANNEL_ROLES:
+        counts = [len(channel_numbers(pad, role)) for pad in pads]
+        for own, count in zip(columns, counts, strict=True):
+            own[role] = range(first, first + count)
+        first += max(counts)
+    return columns
+
+
 def _shared_channels(pad: config.Pad, channels: int) -> FloatArray:
     """Return a matrix (channels, channels), 1 for each two electrodes that share an amplifier, else 0."""
     shared = np.diag((np.arange(channels) < len(pad.electrode_names)).astype(np.float64))
@@ -465,15 +584,15 @@ def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
 
 
-def networks_of(deployment: Deployment) -> list[ElectrodeNetwork]:
-    """Return the electrode network of every pad; identical pads share one object and its table."""
-    shared: dict[tuple[object, ...], ElectrodeNetwork] = {}
+def networks_of(deployment: Deployment) -> list[ChannelModel]:
+    """Return the electrode network, or channel map, of every pad; identical ones share it and its table."""
+    shared: dict[tuple[object, ...], ChannelModel] = {}
     networks = []
     for _, pad in deployment.pads:
-        sheet = deployment.sheets[pad.sheet]
+        sheet = deployment.sheet_of(pad)
         parameters = network_parameters(pad), sheet.ohm_per_square
         if parameters not in shared:
-            shared[parameters] = pad_network(pad, sheet)
+            shared[parameters] = pad_channels(pad, sheet, deployment.nodes[pad.node])
         networks.append(shared[parameters])
     return networks
 
@@ -498,11 +617,17 @@ def default_calibration_id_of(pad: config.Pad, deployment: Deployment) -> str:
     Not with `serial`: calibrations are bound to it anyway, and a replacement node keeps its own when the
     deployment file gets its serial number. Nor with tolerances: they are no part of what is calibrated.
     """
-    node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
-    absent = {"shear", "shear_electrodes"} | (set() if pad.arcs_mm else {"electrode_arcs_mm"})
+    node, sheet = deployment.nodes[pad.node], deployment.sheet_of(pad)
+    absent = {"shear", "shear_electrodes"} | (set() if pad.second_sheet else {"second_sheet"})
+    absent |= set() if pad.arcs_mm else {"electrode_arcs_mm"}
     absent |= set() if pad.switch_states else {"switch_states"}
     absent |= set() if pad.resistance_map else {"resistance_map"}
+    absent |= set() if pad.press_map else {"press_map"}
+    absent |= set() if pad.response else {"response"}
     text = pad.model_copy(update={"serial": None}).model_dump_json(exclude=absent)
-    unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if sheet.hertz_force_n is None else set())
-    text += node.model_dump_json(exclude=_NODE_TOLERANCES) + sheet.model_dump_json(exclude=unstated)
+    text += node.model_dump_json(exclude=_NODE_TOLERANCES)
+    for one in (sheet, deployment.sheets.get(pad.second_sheet or "")):
+        if one is not None:
+            unstated = _SHEET_TOLERANCES | ({"hertz_force_n"} if one.hertz_force_n is None else set())
+            text += one.model_dump_json(exclude=unstated)
     return "nominal-" + hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -17,10 +17,10 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.field.model import spreading_radius
+from handtouch.field.channel_map import ChannelMap
+from handtouch.field.model import ChannelModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
-from handtouch.field.uneven_sheet import unevenness_slopes
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +28,6 @@ _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
 CELLS_PER_TOLERANCE_CELL = 3  # tables of tolerances have 0.9 MB
 _TOLERANCE_STEP = 3e-5  # step of differences, in sides
-_PATCH_STEP = 0.02  # step of second differences: currents of a patch vary no faster
 _EDGE_CELL, _ELECTRODE_END_CELL = 0.003, 0.008
 """Distances from an edge and from an electrode's end below which cells shrink no further, in sides."""
 SEARCH_POINTS = 9
@@ -39,6 +38,7 @@ _MIN_RADIUS_DISTANCE = 1e-3  # distance over a side: the spreading radius vanish
 _SURFACE_CELLS = (8, 16, 32, 64)
 _MAX_SURFACE_ERROR = 1e-7
 """Error between the nodes over a pad's size."""
+_MAX_LOG_SCALE = 2.0  # of a contact, from its median; it vanishes at an outline's vertices
 MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
 n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
@@ -73,6 +73,10 @@ def _slope_operator(cells: int) -> FloatArray:
 class ForwardTable:
     """Forward model of a pad: fractions of its n electrodes and ln of its spreading radius.
 
+    Of a `ChannelMap` the fractions are signals, and its tolerances take the places of those of electrodes: in
+    that of its two ends each channel's own, in those of the waves what all have in common, in those of the
+    second derivatives `patch_slopes`.
+
     nodes: (cells + 1, cells + 1, 4, n + 1), see `hermite_table`. nodes_x, nodes_y: (cells + 1, 2) coordinates
     of the nodes and their derivatives by cell. search_fractions: (81, n), search_cells: (2, 9), see
     `ModelTable`.
@@ -95,8 +99,8 @@ class ForwardTable:
     series_vectors: FloatArray
 
     @classmethod
-    def from_network(cls, model: ElectrodeNetwork) -> ForwardTable:
-        """Tabulate a pad's electrode network."""
+    def from_network(cls, model: ChannelModel) -> ForwardTable:
+        """Tabulate a pad's electrode network, or channel map."""
         ends: tuple[set[float], set[float]] = {0.0, model.a}, {0.0, model.b}
         for end in model.ends:
             ends[end.axis].add(end[end.axis])
@@ -128,7 +132,7 @@ class ForwardTable:
         """Number of electrodes."""
         return int(self.search_fractions.shape[1])
 
-    def with_dead_electrode(self, model: ElectrodeNetwork, electrode: int) -> ForwardTable:
+    def with_dead_electrode(self, model: ChannelModel, electrode: int) -> ForwardTable:
         """Return the table of the same pad with one electrode connected to nothing.
 
         model: the pad's network. The others collect its current in constant proportions; how these vary with
@@ -169,7 +173,7 @@ class ForwardTable:
 
 
 def _spreading_nodes(
-    model: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+    model: ChannelModel, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the positions at which the spreading radius is tabulated, off the edges, where it vanishes."""
     edge = _MIN_RADIUS_DISTANCE
@@ -177,10 +181,10 @@ def _spreading_nodes(
     return np.clip(x, edge * model.a, (1 - edge) * model.a), np.clip(y, edge * model.b, (1 - edge) * model.b)
 
 
-def _log_spreading(model: ElectrodeNetwork, x: FloatArray, y: FloatArray) -> FloatArray:
+def _log_spreading(model: ChannelModel, x: FloatArray, y: FloatArray) -> FloatArray:
     """Return ln of the spreading radius; with a floating electrode, enlarged by the resistance that it and
     the resistors add."""
-    log_radius = np.log(spreading_radius(model, x, y))
+    log_radius = np.log(np.asarray(model.spreading_radius(x, y), np.float64))
     if np.isfinite(model.series_ohm).all():
         return np.asarray(log_radius)
     added_ohm = model.series_resistance(x, y)
@@ -247,14 +251,35 @@ class _Axis:
 
 
 def _tabulate_tolerances(
-    network: ElectrodeNetwork, nodes_x: FloatArray, nodes_y: FloatArray
+    model: ChannelModel, nodes_x: FloatArray, nodes_y: FloatArray
 ) -> tuple[NDArray[np.float32], FloatArray]:
-    """Return nodes of the fields of a network's ends and of the derivatives by its aspect and by waves of its
-    sheet's resistance, and the vectors of its ends.
+    """Return nodes of the fields of a model's tolerances, and the vectors of its ends."""
+    s, t = np.meshgrid(_inside(nodes_x[:, 0]) / model.a, _inside(nodes_y[:, 0]) / model.b)
+    if isinstance(model, ChannelMap):
+        fields, vectors = _fields_of_map(model, s * model.a, t * model.b)
+    else:
+        assert isinstance(model, ElectrodeNetwork)
+        fields, vectors = _fields_of_network(model, s, t)
+    return hermite_table(np.moveaxis(fields, 0, -1)).astype(np.float32), vectors
+
+
+def _fields_of_map(model: ChannelMap, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the fields (columns, y, x) of a map, and its vectors: of two parts of each channel, itself."""
+    own = np.swapaxes(model.channel_slopes(x, y), 0, 1).reshape(-1, *x.shape)
+    variations = model.variation_slopes(x, y).reshape(-1, *x.shape)
+    by_aspect = np.zeros((model.channels, *x.shape))
+    fields = np.concatenate([own, by_aspect, variations, *model.patch_slopes(x, y)])
+    return fields, np.repeat(np.eye(model.channels), 2, axis=0)
+
+
+def _fields_of_network(
+    network: ElectrodeNetwork, s: FloatArray, t: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the fields (columns, y, x) of a network's ends and of the derivatives by its aspect and by waves
+    of its sheet's resistance, and the vectors of its ends.
 
     By differences to networks that are slightly different, but for the waves.
     """
-    s, t = np.meshgrid(_inside(nodes_x[:, 0]) / network.a, _inside(nodes_y[:, 0]) / network.b)
     nominal = network.fractions(s * network.a, t * network.b)
 
     def slope(other: ElectrodeNetwork, step: float) -> FloatArray:
@@ -273,28 +298,16 @@ def _tabulate_tolerances(
             vectors[number, list(electrodes)] = left[:, 0] * singular[0]
             fields[state, number] = right[0].reshape(s.shape)
     by_aspect = slope(network.stretched(math.exp(_TOLERANCE_STEP)), _TOLERANCE_STEP)
-    by_waves = unevenness_slopes(network, s * network.a, t * network.b)
+    by_waves = network.variation_slopes(s * network.a, t * network.b)
     columns = np.concatenate(
         [
             fields.reshape(-1, *s.shape),
             by_aspect,
             by_waves.reshape(-1, *s.shape),
-            *_second_derivatives(network, s, t),
+            *network.patch_slopes(s * network.a, t * network.b),
         ]
     )
-    return hermite_table(np.moveaxis(columns, 0, -1)).astype(np.float32), vectors
-
-
-def _second_derivatives(
-    network: ElectrodeNetwork, s: FloatArray, t: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives (n, y, x) of the fractions by x x and by x y, at fractions s, t of the sides."""
-    half = _PATCH_STEP * network.a
-    x = np.clip(s * network.a, 1.01 * half, network.a - 1.01 * half)
-    y = np.clip(t, _PATCH_STEP, 1 - _PATCH_STEP) * network.b
-    more, less = (network.fractions_with_jacobian(x + step, y)[1] for step in (half, -half))
-    by_x, by_y = np.moveaxis((more - less) / (2 * half), 1, 0)
-    return by_x, by_y
+    return columns, vectors
 
 
 def _inside(x: FloatArray) -> FloatArray:
@@ -306,12 +319,13 @@ def _inside(x: FloatArray) -> FloatArray:
 class SurfacePatches:
     """Surface of a pad in its link's frame, in patches between folds; see `PadSurface`.
 
-    nodes: (patches, cells + 1, cells + 1, 4, 5). ends: (patches,) of y.
+    nodes: (patches, cells + 1, cells + 1, 4, 6). ends: (patches,) of y. curvature_per_m2: Gauss's.
     """
 
     nodes: FloatArray
     ends: FloatArray
     side_x: float
+    curvature_per_m2: float
 
     @classmethod
     def from_surface(cls, surface: Surface, rotation: FloatArray, translation: FloatArray) -> SurfacePatches:
@@ -320,7 +334,7 @@ class SurfacePatches:
         begins = np.append(0.0, surface.folds)
 
         def evaluate(cells: int, inside: FloatArray) -> FloatArray:
-            """Return values (patches, y, x, 5) at nodes or, `inside` of cells, between them."""
+            """Return values (patches, y, x, 6) at nodes or, `inside` of cells, between them."""
             s = inside / cells
             patches = []
             for begin, end in zip(begins, ends, strict=True):
@@ -328,16 +342,29 @@ class SurfacePatches:
                 y_inside = begin + (end - begin) * np.clip(s, 1e-12, 1 - 1e-12)
                 x, y = np.meshgrid(surface.a * s, y_inside)
                 position = np.tensordot(rotation, surface.point(x, y), axes=1) + translation[:, None, None]
-                patches.append(np.stack([*position, *surface.from_rectangle(x, y)], axis=-1))
+                log_scale = np.log(surface.scale(x, y))
+                log_scale = np.clip(log_scale, *(np.median(log_scale) + _MAX_LOG_SCALE * np.array([-1, 1])))
+                columns = [*position, *surface.from_rectangle(x, y), log_scale]
+                patches.append(np.stack(columns, axis=-1))
             return np.stack(patches)
 
         size = max(surface.extent_m)
         for cells in _SURFACE_CELLS:
             nodes = np.stack([hermite_table(patch) for patch in evaluate(cells, np.arange(cells + 1.0))])
             between = evaluate(cells, np.arange(0.5, cells))
-            if np.abs(_mid_cell_values(nodes) - between).max() < _MAX_SURFACE_ERROR * size:
+            error = np.abs(_mid_cell_values(nodes) - between)[..., :5]
+            if error.max() < _MAX_SURFACE_ERROR * size:
                 break
-        return cls(np.ascontiguousarray(nodes), ends, surface.a)
+        return cls(np.ascontiguousarray(nodes), ends, surface.a, _mean_curvature_per_m2(surface))
+
+
+def _mean_curvature_per_m2(surface: Surface) -> float:
+    """Return Gauss's curvature about a surface's middle: -laplace(ln scale) / scale^2 on the rectangle."""
+    x, y, radius = surface.a / 2, surface.b / 2, min(surface.a, surface.b) / 8
+    angle = np.arange(8) * np.pi / 4
+    around = np.log(surface.scale(x + radius * np.cos(angle), y + radius * np.sin(angle))).mean()
+    middle = float(surface.scale(x, y))
+    return float(4 * (np.log(middle) - around) / (radius * middle) ** 2)
 
 
 def _mid_cell_values(nodes: FloatArray) -> FloatArray:

@@ -52,7 +52,8 @@ class Pipeline:
         robots: RobotModels | None = None,
     ) -> None:
         self.model = model
-        self.state = TickState.empty(model.size, len(model.rows_of_hand), model.channels)
+        sizes = model.size, len(model.rows_of_hand), model.channels, len(model.second_pads)
+        self.state = TickState.empty(*sizes)
         self.slab = Slab(model.size, model.slab_channels, model.slab_columns)
         self.cycle = Cycle(period_ns, window)
         self.tick = TickProcessor(model, period_ns, self.state)
@@ -103,9 +104,10 @@ class Pipeline:
         """Compute the requested outputs only."""
         self.add_event(DemandEvent.of(requested, ticks_per_hand_frame))
 
-    def set_gravity(self, directions: NDArray[np.float64]) -> None:
-        """Set the unit direction of gravity in each link's frame (n, 3), NaN where unknown."""
-        self.add_event(GravityEvent(tuple(map(tuple, directions.tolist()))))
+    def set_felt_gravity(self, felt: NDArray[np.float64]) -> None:
+        """Set gravity less acceleration in each link's frame (n, 3), in units of gravity, NaN where
+        unknown."""
+        self.add_event(GravityEvent(tuple(map(tuple, felt.tolist()))))
 
     def link_poses(self, hand: str, t_ns: int) -> tuple[FloatArray, FloatArray] | None:
         """Return the poses of a hand at a time, see `HandPoses.compute`; None without joints."""
@@ -226,6 +228,8 @@ class Pipeline:
         if len(touching):
             solve_contacts(tick, touching)
             tick.sheet_force.store_forces()
+            if tick.second.any_configured:
+                tick.second.store_both()
             tick.output.publish()
             if tick.shear.any_configured:
                 self.state.shear_sample_ns[touching] = 0
@@ -267,10 +271,15 @@ def run_tick(
     changes = detect_contacts(tick.contacts, slab, node_state, cycle, until_ns)
     if len(changes.began):
         tick.sheet_force.begin_contacts(changes.began)
+        tick.second.begin_contacts(changes.began)
+    if tick.second.any_configured:
+        tick.second.read_totals(slab, cycle.sync_ns)
     if len(changes.solved):
         solve_contacts(tick, changes.solved)
     if tick.sheet_force.any_modelled:
         tick.sheet_force.compensate_forces(cycle.sync_ns)
+    if tick.second.any_configured:
+        tick.second.store_forces(cycle.sync_ns)
     tick.output.publish()
     if tick.shear.any_configured:
         tick.shear.update_forces(slab)
@@ -292,8 +301,12 @@ def detect_contacts(
     """
     stage = contacts.stage
     stage.detect_contacts(
-        *(slab.memory, node_state.data, cycle.sync_ns, cycle.previous_sync_ns),
-        *(cycle.period_ns // 2, until_ns),
+        slab.memory,
+        node_state.data,
+        cycle.sync_ns,
+        cycle.previous_sync_ns,
+        cycle.period_ns // 2,
+        until_ns,
     )
     counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved, stage.framed
     if not any(counts):

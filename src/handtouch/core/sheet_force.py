@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from handtouch import sheet
 from handtouch.config import Behaviour
-from handtouch.core.memory import view_memory
-from handtouch.core.stages.sheets import SheetInterval, SheetStage
+from handtouch.core.memory import RowArray, view_memory
+from handtouch.core.stages.loads import SheetInterval, SheetLoads
+from handtouch.core.stages.sheets import SHEET_LOAD_ROW, UPDATE_PERIOD_S, SheetStage
 from handtouch.core.state import SHEET_ELEMENTS, SHEET_PLAYS, TickState
 
 FloatArray = npt.NDArray[np.float64]
@@ -28,7 +29,6 @@ IntArray = npt.NDArray[np.intp]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md and soak_sheets.md
 # measure what they yield.
-UPDATE_PERIOD_S = 0.1
 _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
@@ -57,9 +57,7 @@ _OF_PAD = (
     "compared_ns",
 )
 """Arrays of the state with a row for each pad."""
-_OF_SHEET = (
-    "sheet_elements",
-    "sheet_plays",
+_OF_COMPENSATOR = (
     "back_n",
     "back_std_n",
     "press_n",
@@ -67,17 +65,23 @@ _OF_SHEET = (
     "flow_s",
     "impulse_ns",
     "powered",
-    "bank_log_weight",
-    "bank_back_n",
-    "bank_exponent",
-    "bank_exponent_variance",
-    "bank_sum",
-    "bank_before",
-    "bank_window",
-    "bank_age_s",
-    "bank_growth",
 )
+"""Arrays of the same names as in `sheet.CompensatorState`"""
+_OF_BANK = {field.name: f"bank_{field.name}" for field in fields(sheet.BankState)}
+_OF_SHEET = ("sheet_elements", "sheet_plays", *_OF_COMPENSATOR, *_OF_BANK.values())
 """Arrays with a row for each modelled sheet, those of one behaviour in consecutive rows."""
+_ZERO_AT_FIRST = (
+    "evidence_contacts",
+    "touched_s",
+    "log_gain",
+    "last_touch_ns",
+    "compared_ns",
+    "force_confirmed",
+    "touched_at_begin_s",
+    "sheets_updated_ns",
+    "uncertainty_waited_s",
+    "new_contact",
+)
 _OF_BEHAVIOUR = ("back_waited_s", "load_is_old")
 _OF_ALL = ("sheets_updated_ns", "uncertainty_waited_s")
 _MIN_REFERENCE_INTERVAL_S = 1.0  # references in quicker succession aren't independent
@@ -104,7 +108,8 @@ class ForceReference(NamedTuple):
 class SheetBehaviour:
     """Models of a `[sheet.NAME.behaviour]`, and the uncertainty of their parameters.
 
-    material: name of the sheet; what pads with it show is evidence for one another.
+    material: name of the sheet; what pads with it show is evidence for one another. max_force_n: greatest
+    force of a contact, infinite where it is unknown.
     """
 
     model: sheet.SheetModel
@@ -114,6 +119,7 @@ class SheetBehaviour:
     forget_time_s: float
     prior: sheet.BankPrior
     material: str = ""
+    max_force_n: float = math.inf
 
 
 class SheetForceCompensation:
@@ -151,12 +157,14 @@ class SheetForceCompensation:
         self._relative_std = held.relative_std  # standard deviation over force
         self._period_ns = period_ns
         self._gain = np.ones(n)
-        self._results = np.zeros((4, n))
+        self._results = np.zeros(n, SHEET_LOAD_ROW).view(np.recarray)
         self._reset()
         self.groups = _make_groups(behaviours, held, self._results)
+        self.loads = SheetLoads(held.memory, view_memory(self._sheet_rows()), SHEET_ELEMENTS, SHEET_PLAYS)
+        """histories of the sheets, for loads by readings that aren't decided yet"""
         stage = self._make_stage()
         self.compensate_forces, self.store_forces = stage.compensate_forces, stage.store_forces
-        self.complete_update = stage.complete_update
+        self.complete_update, self.find_intervals = stage.complete_update, stage.find_intervals
 
     def with_behaviours(
         self, before: Sequence[SheetBehaviour | None], behaviours: Sequence[SheetBehaviour | None]
@@ -210,12 +218,8 @@ class SheetForceCompensation:
         unreliable, reliable = ForceReliability.UNRELIABLE, ForceReliability.RELIABLE
         self.state[:] = np.where(self.modelled, unreliable, reliable)
         self.force_n[:] = self.std_n[:] = self._relative_std[:] = np.nan
-        zero: tuple[npt.NDArray[Any], ...] = (
-            *(self.contacts, self.touched_s, self.log_gain, self._last_touch_ns, self._compared_ns),
-            *(self._confirmed, self._begin_s, self._updated_ns, self._waited_s, self._new_contacts),
-        )
-        for column in zero:
-            column[:] = 0
+        for name in _ZERO_AT_FIRST:
+            getattr(self._held, name)[:] = 0
         self.log_gain_std[:] = self._first_gain_std
 
     def set_back_force(
@@ -281,7 +285,7 @@ class SheetForceCompensation:
     def begin_contacts(self, began: IntArray) -> None:
         """Note contacts that began on these pads. In the pause before, a press below the threshold may have
         wiped the back force: take the mean of both possibilities, and their difference as uncertainty."""
-        pause_s = (self._updated_ns[0] - self._last_touch_ns[began]) * 1e-9
+        pause_s = np.maximum(self._updated_ns[0] - self._last_touch_ns[began], 0) * 1e-9
         for group in self.groups:
             rows = np.searchsorted(group.pads, began)
             here = np.flatnonzero(group.pads[np.minimum(rows, len(group.pads) - 1)] == began)
@@ -327,24 +331,24 @@ class SheetForceCompensation:
         return len(pads)
 
     def _make_stage(self) -> SheetStage:
-        rows = [pad for group in self.groups for pad in group.pads.tolist()]
-        pads = np.array(rows + [0] * (len(self._gain) - len(rows)), dtype=np.int64)
+        pads = np.array([pad for group in self.groups for pad in group.pads.tolist()], np.int64)
+        limits = [group.max_force_n for group in self.groups for _ in group.pads]
         return SheetStage(
-            self._held.memory,
+            self._held,
+            self.loads,
             view_memory(pads),
-            len(rows),
+            view_memory(np.array(limits, np.float64)),
             view_memory(self._gain),
-            view_memory(self._results),
-            SHEET_ELEMENTS,
-            SHEET_PLAYS,
+            self._results,
             self._period_ns,
-            UPDATE_PERIOD_S,
-            self._update,
-            self._update_began,
-            lambda dt_s: [group.interval(dt_s) for group in self.groups],
+            self,
         )
 
-    def _update(self, uncertainties: bool) -> None:
+    def make_steps(self, dt_s: float) -> list[SheetInterval]:
+        """Return the intervals of all behaviours of a duration."""
+        return [group.interval(dt_s) for group in self.groups]
+
+    def update(self, uncertainties: bool) -> None:
         """Update back forces that are due, and with `uncertainties` those of the forces of touched pads."""
         for number, group in enumerate(self.groups):
             if self._held.back_waited_s[number] >= UPDATE_PERIOD_S:
@@ -355,7 +359,7 @@ class SheetForceCompensation:
             self._waited_s[0] = 0.0
             self._update_uncertainty(touching)
 
-    def _update_began(self) -> None:
+    def update_began(self) -> None:
         """Compute standard deviations and reliability of pads whose contact began in this tick."""
         began = (self._held.touching & self._new_contacts).astype(np.bool_)
         # the end of the interval counts all of it
@@ -372,9 +376,9 @@ class SheetForceCompensation:
             self.std_n[group.rows] = group.compensator.std_n()
         with np.errstate(all="ignore"):
             relative = self._held.uncompensated_std_n[pressed] / apparent_n[pressed]
-        # either includes the error of the contact law
-        common = np.maximum(relative, self.log_gain_std[pressed])
-        variance = np.square(self.std_n[pressed]) + np.square(force * common)
+            # either includes the error of the contact law
+            common = np.maximum(relative, self.log_gain_std[pressed])
+            variance = np.square(self.std_n[pressed]) + np.square(force * common)
         self.std_n[pressed] = std = np.sqrt(variance)
         self._relative_std[pressed] = std / np.maximum(force, _MIN_FORCE_N)
         enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
@@ -394,12 +398,12 @@ class _BehaviourGroup:
         pads: IntArray,
         state: sheet.CompensatorState,
         bank: sheet.BankState,
-        results: FloatArray,
+        results: RowArray,
     ) -> None:
         self.pads, self.number, self.first = pads, number, first
         whole = len(pads) == pads[-1] - pads[0] + 1
         self.rows: slice | IntArray = slice(int(pads[0]), int(pads[-1]) + 1) if whole else pads
-        self._forget_time_s = behaviour.forget_time_s
+        self._forget_time_s, self.max_force_n = behaviour.forget_time_s, behaviour.max_force_n
         self.bank = sheet.ModelBank(behaviour.model.adaptation, behaviour.prior, bank)
         self.compensator = sheet.SheetCompensator(
             behaviour.model,
@@ -409,7 +413,8 @@ class _BehaviourGroup:
             state=state,
             bank=self.bank,
         )
-        self.compensator.last_step = results[:, first : first + len(pads)]
+        steps = results.view(np.float64).reshape(len(results), -1)
+        self.compensator.last_step = steps[first : first + len(pads)].T
         if behaviour.back_force_std_n and np.any(behaviour.model.adaptation.share):
             self.compensator.set_back_force(0.0, behaviour.back_force_std_n)
 
@@ -417,18 +422,19 @@ class _BehaviourGroup:
         """Return an interval of this duration."""
         model = self.compensator.model
         creep, hysteresis = model.creep.discretise(dt_s), model.hysteresis.inverse
+        arrays = {
+            "lines": creep.inverse_lines,
+            "transition": creep.transition,
+            "widths_n": hysteresis.widths_n,
+            "weights": hysteresis.weights,
+        }
         return SheetInterval(
             self.number,
-            self.first,
-            self.first + len(self.pads),
+            slice(self.first, self.first + len(self.pads)),
             dt_s,
             float(model.creep.total),
             float(hysteresis.base),
-            view_memory(creep.inverse_lines.copy()),
-            view_memory(creep.transition.copy()),
-            view_memory(np.array(hysteresis.widths_n, dtype=np.float64)),
-            view_memory(np.array(hysteresis.weights, dtype=np.float64)),
-            len(creep.inverse_lines),
+            {name: view_memory(np.array(values, np.float64)) for name, values in arrays.items()},
         )
 
     def decay_back_force(self, rows: IntArray, pause_s: FloatArray) -> None:
@@ -446,7 +452,7 @@ class _BehaviourGroup:
 
 
 def _make_groups(
-    behaviours: Sequence[SheetBehaviour | None], held: TickState, results: FloatArray
+    behaviours: Sequence[SheetBehaviour | None], held: TickState, results: RowArray
 ) -> list[_BehaviourGroup]:
     """Return the pads by sheet behaviour, with fresh sheets in consecutive rows of the state."""
     groups, first = [], 0
@@ -458,21 +464,16 @@ def _make_groups(
         if elements > SHEET_ELEMENTS or plays > SHEET_PLAYS:
             raise ValueError(f"a sheet model of {elements} elements and {plays} plays is too large")
         state = sheet.CompensatorState(
-            held.sheet_elements[rows].T[:elements],
-            held.sheet_plays[rows].T[:plays],
-            *(held.back_n[rows], held.current_flow_s[rows], held.back_std_n[rows], held.press_n[rows]),
-            *(held.flow_s[rows], held.impulse_ns[rows], held.powered[rows]),
-            held.back_waited_s[number : number + 1],
-            held.load_is_old[number : number + 1],
+            elements=held.sheet_elements[rows].T[:elements],
+            plays=held.sheet_plays[rows].T[:plays],
+            waited_s=held.back_waited_s[number : number + 1],
+            load_is_old=held.load_is_old[number : number + 1],
+            **{name: getattr(held, name)[rows] for name in _OF_COMPENSATOR},
         )
         for part in vars(state).values():
             part[:] = 0
         state.powered[:] = True
-        bank = sheet.BankState(
-            *(held.bank_log_weight[rows], held.bank_back_n[rows], held.bank_exponent[rows]),
-            *(held.bank_exponent_variance[rows], held.bank_sum[rows], held.bank_before[rows]),
-            *(held.bank_window[rows], held.bank_age_s[rows], held.bank_growth[rows]),
-        )
+        bank = sheet.BankState(**{name: getattr(held, array)[rows] for name, array in _OF_BANK.items()})
         groups.append(_BehaviourGroup(number, rows.start, kind, pads, state, bank, results))
     return groups
 

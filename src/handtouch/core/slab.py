@@ -92,14 +92,19 @@ class Slab:
         self._high_limits = np.zeros((size, channels), dtype=np.int64)
         self._counts = np.zeros((size, channels), dtype=np.int64)
         self.memory = receive.SampleMemory(
-            self._words.data,
-            self._arrival_ns,
-            self._repeat_counts,
-            self.contrary_counts.data,
-            memoryview(self._fresh),
-            memoryview(self._single),
-            memoryview(self._contrary),
-            *(view_memory(a) for a in (self._counts, self._fields, self._low_limits, self._high_limits)),
+            {
+                "words": self._words.data,
+                "arrival_ns": self._arrival_ns,
+                "repeat_counts": self._repeat_counts,
+                "contrary_counts": self.contrary_counts.data,
+                "fresh": memoryview(self._fresh),
+                "single": memoryview(self._single),
+                "contrary": memoryview(self._contrary),
+                "counts": view_memory(self._counts),
+                "fields": view_memory(self._fields),
+                "low_limits": view_memory(self._low_limits),
+                "high_limits": view_memory(self._high_limits),
+            }
         )
         """the same memory as the stages take it"""
         for slot in range(size):

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.core.memory import row_count, view_memory
-from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
-from handtouch.core.stages.shear import SHEAR_CHANNELS
-from handtouch.core.stages.slip import SLIP_COUNT
+from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES, SHEAR_CHANNELS, SLIP_ROW
 from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 
-VERSION = 2
+VERSION = 3
 """Version of the fields' meanings; their names, types and shapes are in the hash of the layout."""
 SHEET_ELEMENTS = SHEET_PLAYS = 8
+LOAD_TERMS = 9
+"""terms of a polynomial of the second degree in three numbers, without the constant"""
 _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9
 _NEVER_SAMPLED_NS = 1 << 60
@@ -47,15 +47,15 @@ class StateLayoutError(ValueError):
 class Stored:
     """Type, shape and first value of a field.
 
-    shape: for each dimension "pads", "hands", "channels", a number, or a row of named numbers.
-    """
+    shape: for each dimension "pads", "hands", "channels", "second sheets", a number, or a row of named
+    numbers."""
 
     def __init__(self, dtype: str, *shape: int | str | np.dtype[np.void], fill: float = 0) -> None:
         self.shape = tuple(row_count(size) if isinstance(size, np.dtype) else size for size in shape)
         self.dtype, self.fill = np.dtype(dtype), fill
 
 
-_PADS, _HANDS, _CHANNELS = "pads", "hands", "channels"
+_PADS, _HANDS, _CHANNELS, _SECOND = "pads", "hands", "channels", "second sheets"
 _USUAL_CHANNELS = 4
 
 
@@ -63,8 +63,8 @@ _USUAL_CHANNELS = 4
 class TickState:
     """State of `pads` pads on `hands` hands; made by `empty`. All arrays are views of `block`.
 
-    channels: number of electrodes of the pad that has most.
-    """
+    channels: number of electrodes of the pad that has most. second: of the second sheets of pads with two, as
+    of so many pads with one channel: their baselines and behaviour; None without any."""
 
     pads: int
     hands: int
@@ -140,9 +140,15 @@ class TickState:
     drift_anchor: Annotated[FloatArray, Stored("<f8", _PADS)]
     drift_anchored_s: Annotated[FloatArray, Stored("<f8", _PADS)]
     common_drift: Annotated[FloatArray, Stored("<f8", _HANDS)]
-    gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
-    smoothed_gravity: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
-    gravity_slope: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS, 3)]
+    # what orientation and acceleration of links do to them, see `LinkLoad`
+    felt: Annotated[FloatArray, Stored("<f8", _PADS, 3)]
+    load_terms: Annotated[FloatArray, Stored("<f8", _PADS, LOAD_TERMS)]
+    smoothed_load_terms: Annotated[FloatArray, Stored("<f8", _PADS, LOAD_TERMS)]
+    load_term_sum: Annotated[FloatArray, Stored("<f8", _PADS, LOAD_TERMS)]
+    """since the last block"""
+    load_term_count: Annotated[FloatArray, Stored("<f8", 1)]
+    load_coefficients: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS, LOAD_TERMS)]
+    load_covariance: Annotated[FloatArray, Stored("<f8", _PADS, LOAD_TERMS, LOAD_TERMS)]
     block_sum: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     block_squares: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     block_count: Annotated[FloatArray, Stored("<f8", _PADS)]
@@ -165,6 +171,10 @@ class TickState:
     """of the two blocks before"""
     disturbance: Annotated[FloatArray, Stored("<f8", _PADS, _CHANNELS)]
     """amplitude of hum and noise [counts]"""
+    peak_level: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """largest mean of the sum of the channels in a block since the contact began; 0 without one"""
+    still_s: Annotated[FloatArray, Stored("<f8", _PADS)]
+    """time for which what is left of a contact has been still"""
     threshold_factor: Annotated[FloatArray, Stored("<f8", _PADS, fill=1)]
     """by which hum and noise raise the thresholds of contacts"""
 
@@ -219,8 +229,8 @@ class TickState:
     grouped: Annotated[BoolArray, Stored("?", _PADS, _PADS)]
 
     # slip, see `SlipDetector`
-    slip: Annotated[FloatArray, Stored("<f8", _PADS, SLIP_COUNT)]
-    """see `stages.slip.SLIP_SLICES`"""
+    slip: Annotated[FloatArray, Stored("<f8", _PADS, SLIP_ROW)]
+    """see `stages.rows.SLIP_ROW`"""
     slip_contact_id: Annotated[Uint32Array, Stored("<u4", _PADS)]
     slip_sample_ns: Annotated[IntArray, Stored("<i8", _PADS)]
     slip_requested: Annotated[BoolArray, Stored("?", _PADS)]
@@ -244,16 +254,29 @@ class TickState:
     part_frames: Annotated[FloatArray, Stored("<f8", _PADS, np.dtype((PART_FRAMES, 2)), fill=math.nan)]
     """of two contacts on a pad, see `stages.rows.PART_FRAMES`"""
 
+    # pads with two sheets, see `SecondSheets`
+    second_count: Annotated[IntArray, Stored("<i8", _SECOND)]
+    """last count of a second sheet's channel"""
+    equal_samples: Annotated[IntArray, Stored("<i8", _SECOND)]
+    """touched samples in a row with this count"""
+    joint_force_n: Annotated[FloatArray, Stored("<f8", _SECOND, fill=math.nan)]
+    """force by both sheets; NaN where the second isn't used"""
+    joint_std_n: Annotated[FloatArray, Stored("<f8", _SECOND, fill=math.nan)]
+
     # messages
     contact_seq: Annotated[IntArray, Stored("<i8", _PADS)]
     frame_seq: Annotated[IntArray, Stored("<i8", 1)]
     frame_tick: Annotated[IntArray, Stored("<i8", 1)]
     frame_sync_ns: Annotated[IntArray, Stored("<i8", 1)]
 
+    second: TickState | None = field(default=None, repr=False)
+
     @classmethod
-    def empty(cls, pads: int, hands: int = 1, channels: int = _USUAL_CHANNELS) -> TickState:
+    def empty(
+        cls, pads: int, hands: int = 1, channels: int = _USUAL_CHANNELS, second_sheets: int = 0
+    ) -> TickState:
         """Return the state before the first tick."""
-        sizes = {_PADS: pads, _HANDS: hands, _CHANNELS: channels}
+        sizes = {_PADS: pads, _HANDS: hands, _CHANNELS: channels, _SECOND: second_sheets}
         places: list[tuple[str, Stored, tuple[int, ...], int]] = []
         end = 0
         for name, stored in _stored_fields():
@@ -266,12 +289,15 @@ class TickState:
             size = math.prod(shape) * stored.dtype.itemsize
             arrays[name] = block[begin : begin + size].view(stored.dtype).reshape(shape)
             arrays[name].fill(stored.fill)
-        return cls(pads, hands, channels, block, **arrays)
+        second = cls.empty(second_sheets, hands, channels=1) if second_sheets else None
+        return cls(pads, hands, channels, block, **arrays, second=second)
 
     def layout(self) -> str:
         """Return version and hash of the declared fields, and the number of channels if it isn't four."""
-        usual = self.channels == _USUAL_CHANNELS
-        return _declared_layout() + ("" if usual else f", {self.channels} channels")
+        layout = _declared_layout()
+        if self.channels != _USUAL_CHANNELS:
+            layout += f", {self.channels} channels"
+        return layout + (f", {self.second.pads} second sheets" if self.second else "")
 
     @cached_property
     def memory(self) -> dict[str, memoryview[Any]]:
@@ -285,7 +311,7 @@ class TickState:
 
     def save(self) -> bytes:
         """Return the bytes of all arrays."""
-        return self.block.tobytes()
+        return self.block.tobytes() + (self.second.save() if self.second else b"")
 
     def load(self, saved: bytes, layout: str) -> None:
         """Write a saved state into the arrays. Raises StateLayoutError, changing nothing."""
@@ -293,12 +319,15 @@ class TickState:
             raise StateLayoutError(
                 f"the state has the layout {layout or 'none'}, this handtouch {self.layout()}"
             )
-        if len(saved) != len(self.block):
+        size = len(self.block) + (len(self.second.block) if self.second else 0)
+        if len(saved) != size:
             raise StateLayoutError(
-                f"the state has {len(saved)} bytes, one of {self.pads} pads on {self.hands} hands has "
-                f"{len(self.block)}"
+                f"the state has {len(saved)} bytes, one of {self.pads} pads on {self.hands} hands has {size}"
             )
-        self.block[:] = np.frombuffer(saved, dtype=np.uint8)
+        whole = np.frombuffer(saved, dtype=np.uint8)
+        self.block[:] = whole[: len(self.block)]
+        if self.second:
+            self.second.block[:] = whole[len(self.block) :]
 
 
 @cache

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.baseline import Baseline
+from handtouch.core.baseline import Baseline, BaselineSettings
 from handtouch.core.columns import PadColumns, TickResult
 from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, make_solver
 from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
 from handtouch.core.pad_model import PadModel
-from handtouch.core.shear import ShearForces, changed_shear_pads
+from handtouch.core.second_sheets import SecondSheets
+from handtouch.core.shear_pads import changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
-from handtouch.core.slip import SlipDetector
 from handtouch.core.stages.publish import ContactColumns
+from handtouch.core.stages.shear import ShearForces, ShearTable
+from handtouch.core.stages.slip import SlipDetector
 from handtouch.core.state import TickState
 from handtouch.wire import PadState
 
@@ -31,7 +33,8 @@ class TickProcessor:
     def __init__(self, model: PadModel, period_ns: int, state: TickState | None = None) -> None:
         self.model = model
         if state is None:
-            state = TickState.empty(model.size, len(model.rows_of_hand), model.channels)
+            sizes = model.size, len(model.rows_of_hand), model.channels, len(model.second_pads)
+            state = TickState.empty(*sizes)
         self.state = held = state
         self.columns = PadColumns.of_state(held)
         self.counts: NDArray[np.int64] = np.zeros((model.size, model.channels), dtype=np.int64)
@@ -40,15 +43,16 @@ class TickProcessor:
         """counts of all channels, electrodes first"""
         held.max_sample_period_ns[:] = period_ns
         self.baseline = Baseline(
-            *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
-            *(model.max_rise_time_s, model.rows_of_hand.values()),
-            state=held,
-            electrode_counts=model.electrode_counts,
+            _baseline_settings(model), model.rows_of_hand.values(), held, model.electrode_counts
         )
         """counts of untouched pads"""
-        self.contacts = ContactDetector(_detection_settings(model), self.baseline.expected_counts, held)
+        self.contacts = ContactDetector(
+            DetectionSettings.of_model(model), self.baseline.expected_counts, held
+        )
         self.sheet_force = SheetForceCompensation(model.behaviours, period_ns, held)
         """compensation of creep, adaptation and hysteresis"""
+        self.second = SecondSheets(model, held, period_ns)
+        """second sheets of pads with two"""
         self.slip = SlipDetector(
             period_ns * 1e-9,
             self.columns.values,
@@ -70,12 +74,10 @@ class TickProcessor:
         model, held = self.model, self.state
         if any(now is not before for now, before in zip(model.forward_tables, self._tables, strict=True)):
             self._set_stages(model)
-        self.contacts.set_settings(_detection_settings(model))
-        self.baseline.set_settings(
-            *(model.noise_counts, model.begin_threshold_counts, model.end_threshold_counts),
-            model.max_rise_time_s,
-        )
+        self.contacts.set_settings(DetectionSettings.of_model(model))
+        self.baseline.set_settings(_baseline_settings(model))
         self.sheet_force.refresh()
+        self.second.refresh(model)
         self.slip.refresh()
         np.greater(held.force_requested, model.quarantined, out=self._estimate_force)
         self.output.publish()
@@ -104,6 +106,8 @@ class TickProcessor:
         """Apply a pad's calibration as a whole; forces by another contact law need new evidence."""
         if calibration.law != self.model.calibrations[pad].law:
             self.sheet_force.reset_evidence(pad)
+        if calibration.second_law != self.model.calibrations[pad].second_law:
+            self.second.reset_evidence(pad)
         self.model.set_calibration(pad, calibration)
         self.state.misfits[pad] = 0.0
         self.refresh()
@@ -115,6 +119,7 @@ class TickProcessor:
         self.baseline.reset_pad(pad)
         self.state.misfits[pad] = 0.0
         self.sheet_force.reset_evidence(pad, new_sheet=True)
+        self.second.reset_evidence(pad, new_sheet=True)
         self.shear.forget_rest([pad])
         self.discard_solutions(np.array([pad]))
 
@@ -127,6 +132,7 @@ class TickProcessor:
         self.sheet_force = self.sheet_force.with_behaviours(self.model.behaviours, model.behaviours)
         for pad in changed.tolist():
             self.sheet_force.reset_evidence(pad)
+            self.second.reset_evidence(pad)
         self.state.misfits[changed] = 0.0
         moved = changed_shear_pads(self.model.shear_pads, model.shear_pads)
         self.model = model
@@ -143,6 +149,7 @@ class TickProcessor:
         held.values[pads] = np.nan
         held.parts[pads, : PART_SLICES["newest_id"].start] = held.parts[pads, PART_COUNT:] = np.nan
         held.uncompensated_force_n[pads] = np.nan
+        self.second.discard(pads)
         self.shear.discard(pads)
         self.slip.restart_contacts(pads)  # a position that a new calibration moves doesn't slip
 
@@ -155,19 +162,27 @@ class TickProcessor:
     def _set_stages(self, model: PadModel) -> None:
         """Set the stages that read the model's arrays in place."""
         columns, self._tables = self.columns, list(model.forward_tables)
+        self.second.make_stage(model, self.sheet_force)
+        measured = {
+            "saturated": self.contacts.saturated,
+            "noise_squared": self.state.noise_squared,
+            "misfits": self.state.misfits,
+        }
         self.solver = make_solver(
-            *(
-                model,
-                self.contacts.currents,
-                self.contacts.offset_std_a,
-                self._estimate_force,
-                columns.values,
-            ),
-            *(self.state.parts, self.contacts.saturated, self.state.noise_squared, self.state.misfits),
+            model,
+            currents=self.contacts.currents,
+            offset_std_a=self.contacts.offset_std_a,
+            force_requested=self._estimate_force,
+            values=columns.values,
+            parts=self.state.parts,
+            measured=measured,
+            both=self.second.both,
         )
         self.output = ContactColumns(model, self.state, columns)
         statuses = columns.position_status, columns.force_status
-        self.shear = ShearForces(model.shear_pads, self.state, *statuses, model.mounts)
+        self.shear = ShearForces(
+            [ShearTable(*shear) for shear in model.shear_pads], self.state, *statuses, model.mounts
+        )
         """force vectors of contacts above shear pads"""
 
     def detect_slips(self, result: TickResult) -> None:
@@ -179,13 +194,17 @@ class TickProcessor:
         critical path: it changes no contact."""
         if self.sheet_force.any_modelled:
             self.sheet_force.complete_update()
+        if self.second.any_configured:
+            self.second.prepare_next_tick(self.sync_ns)
         if self.sync_ns:
             self.baseline.update_baseline(self.sync_ns, self.contacts.touching)
 
 
-def _detection_settings(model: PadModel) -> DetectionSettings:
-    return DetectionSettings(
-        *(model.ampere_per_count, model.mean_ampere_per_count, model.noise_counts),
-        *(model.begin_threshold_a, model.end_threshold_a, model.begin_debounce_ns),
-        *(model.end_debounce_ns, model.max_gap_periods),
+def _baseline_settings(model: PadModel) -> BaselineSettings:
+    return BaselineSettings(
+        model.noise_counts,
+        model.begin_threshold_counts,
+        model.end_threshold_counts,
+        model.touch.max_rise_time_s,
+        model.magnetic,
     )

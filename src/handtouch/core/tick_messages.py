@@ -172,6 +172,7 @@ class TickMessages:
             "sample_ns": columns.sample_ns[rows],
             "position_status": columns.position_status[rows],
             "force_status": columns.force_status[rows],
+            "contact_radius_status": columns.contact_radius_status[rows],
             **{name: column[rows] for name, column in columns.published.items()},
         }
 
@@ -193,6 +194,7 @@ class TickMessages:
             sample_ns=self._tick.columns.sample_ns[rows].astype("<i8").tobytes(),
             fresh=slab.fresh[rows].tobytes(),
             retained=False,
+            second_counts=self._tick.second.counts(rows, self._tick.channel_counts).tobytes(),
         )
 
     def _contact_message(

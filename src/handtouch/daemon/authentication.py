@@ -20,7 +20,7 @@ import zmq
 from zmq.utils import z85
 
 from handtouch.client import keys
-from handtouch.client.connection import KEEPALIVE_OPTIONS
+from handtouch.client.socket_options import KEEPALIVE_OPTIONS
 from handtouch.daemon.cause_counter import CauseCounter
 from handtouch.daemon.connection_limit import ConnectionLimit
 from handtouch.daemon.connections import (

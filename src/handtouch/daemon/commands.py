@@ -93,6 +93,7 @@ class _CalibrateArguments(Table):
     gains: Annotated[tuple[Gain, ...], Field(strict=False)] | None = None
     offset_counts: Annotated[tuple[Offset, ...], Field(strict=False)] | None = None
     law: _LawArguments | None = None
+    second_law: _LawArguments | None = None
 
 
 class _ReloadArguments(Table):
@@ -241,6 +242,7 @@ class ControlCommands:
         hand, link = self._pad_names[pad]
         calibration, model = pipeline.calibrations[pad], pipeline.model
         law = calibration.law or model.default_law(pad)
+        second = calibration.second_law or model.default_second_law(pad)
         return {
             "hand": hand,
             "link": link,
@@ -251,7 +253,8 @@ class ControlCommands:
             "offset_counts": list(
                 offsets or pipeline.tick.baseline.expected_counts[pad, : self._channels(pad)].tolist()
             ),
-            "law": {key: getattr(law, key) for key in _LawArguments.model_fields},
+            "law": _law_values(law),
+            "second_law": None if second is None else _law_values(second),
             "store": None if self._reporter.supervisor is None else self._reporter.supervisor.store,
         }
 
@@ -267,19 +270,23 @@ class ControlCommands:
                 f"offset_counts = {list(offsets)}: larger than half the range, {max_counts:.0f} counts"
             )
         before = pipeline.calibrations[pad]
-        law = before.law
-        if request.law is not None:
-            law = LawParameters(**request.law.model_dump(), covariance=((0.0,) * 3,) * 3)
+        if request.second_law is not None and not pipeline.tick.second.has_second(pad):
+            raise RefusedError(f"second_law: {request.pad} has one sheet")
+        laws = [
+            own if new is None else LawParameters(**new.model_dump(), covariance=((0.0,) * 3,) * 3)
+            for own, new in ((before.law, request.law), (before.second_law, request.second_law))
+        ]
         gains = before.gains if request.gains is None else request.gains
-        pipeline.set_calibration(pad, replace(before, calibration_id=name, gains=gains, law=law))
+        calibration = replace(before, calibration_id=name, gains=gains, law=laws[0], second_law=laws[1])
+        pipeline.set_calibration(pad, calibration)
         pipeline.add_event(EvidenceEvent(pad))
         if offsets is not None:
             pipeline.add_event(BaselineEvent(pad, offsets, (0.0,) * len(offsets)))
         if self._reporter.supervisor is not None:
             parts = ("gains", "law", "offset_counts")
-            self._reporter.supervisor.register_manual_calibration(
-                pad, {part for part in parts if getattr(request, part) is not None}, offsets
-            )
+            given = {part for part in parts if getattr(request, part) is not None}
+            given |= set() if request.second_law is None else {"law"}
+            self._reporter.supervisor.register_manual_calibration(pad, given, offsets)
 
     def _channels(self, pad: int) -> int:
         return int(self._pipeline.model.electrode_counts[pad])
@@ -383,6 +390,10 @@ class ControlCommands:
             return self._demand.scenes.pads.select(patterns)
         except ValueError as error:
             raise RefusedError(str(error)) from error
+
+
+def _law_values(law: LawParameters) -> dict[str, Any]:
+    return {key: getattr(law, key) for key in _LawArguments.model_fields}
 
 
 def _check_base_scene(request: _SceneArguments) -> None:

@@ -53,7 +53,7 @@ from handtouch.daemon.joint_messages import JointPublisher
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.daemon.publisher import Publisher, RetainedMessages
 from handtouch.daemon.sampling import SamplingController
-from handtouch.daemon.status_reporter import StatusReporter
+from handtouch.daemon.status_reporter import Buses, Statistics, StatusReporter, Workers
 from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand.joints import JointStateBuffer
@@ -115,7 +115,7 @@ class HandtouchDaemon(Closing):
         self._busy_poll = BusyPoll(round(settings.busy_poll_us * 1e3))
         pipeline.transforms.joints_at = inputs.joints_at
         self.joint_publisher = JointPublisher(robots, inputs.sent_joints_at, publisher, session)
-        self.gravity = GravityTracker(robots, pipeline.model.size, inputs.joints_at, inputs.gravity_direction)
+        self.gravity = GravityTracker(robots, pipeline.model.size, inputs.joints_at, inputs.base_pose)
         self.percepts = PerceptPublisher(deployment, pipeline, publisher, session)
         self._stack.callback(self.percepts.close)
         self.master = Master(self.ports, self._node_specs(), period_ns)
@@ -124,17 +124,16 @@ class HandtouchDaemon(Closing):
         self.reporter = StatusReporter(
             deployment,
             pipeline,
-            self.master,
-            self.ports,
-            self.sync,
+            Buses(self.master, self.ports, self.sync),
             publisher,
             started_ns=now_ns,
-            wall_offset_ns=lambda: time.time_ns() - time.monotonic_ns(),
-            process_statistics=process_statistics,
-            refusals=self._refusals,
-            input_statistics=inputs.statistics,
-            supervisor=self.supervisor,
-            percepts=self.percepts.client,
+            statistics=Statistics(
+                wall_offset_ns=lambda: time.time_ns() - time.monotonic_ns(),
+                process=process_statistics,
+                refusals=self._refusals,
+                inputs=inputs.statistics,
+            ),
+            workers=Workers(self.supervisor, self.percepts.client),
             on_message=on_message,
         )
         scenes = ActiveScenes(deployment.scene, pad_names(deployment))
@@ -315,8 +314,8 @@ class HandtouchDaemon(Closing):
         """
         self.reporter.stage_timer.begin_period(self.sync.overruns, not self.pipeline.cycle.ticked)
         self.inputs.poll(now_ns)
-        if (gravity := self.gravity.update_directions(now_ns)) is not None:
-            self.pipeline.set_gravity(gravity)
+        if (felt := self.gravity.update_felt(now_ns)) is not None:
+            self.pipeline.set_felt_gravity(felt)
         if (late := self.pipeline.finish_cycle(sync_ns, now_ns)) is not None:
             self._complete_tick(late, on_tick)
         self.pipeline.begin_cycle(sync_ns, now_ns)

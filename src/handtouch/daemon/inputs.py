@@ -79,7 +79,7 @@ class InputReceiver:
         self._drops = CauseCounter(_log, "input dropped", DROP_CAUSES)
         self._on_force_reference = on_force_reference
         self._joints = joints
-        self._gravity_by_hand: dict[str, NDArray[np.float64]] = {}  # from the newest joint state
+        self._base_poses: dict[tuple[str, str], NDArray[np.float64]] = {}  # from the newest joint state
         self._row_by_pad = {name: pad for pad, name in enumerate(pads)}
         self._hands = {hand for hand, _ in pads}
         self._newest_sample_ns: dict[str, int] = {}
@@ -167,9 +167,9 @@ class InputReceiver:
         states = self._joints.get(hand)
         return None if states is None else states.interpolate(t_ns, as_sent=True)
 
-    def gravity_direction(self, hand: str) -> NDArray[np.float64] | None:
-        """Return the direction of gravity (3,) in a hand's base, None if no joint state had it."""
-        return self._gravity_by_hand.get(hand)
+    def base_pose(self, hand: str, key: str) -> NDArray[np.float64] | None:
+        """Return the "gravity" (3,) or "orientation" (4,) of a hand's base; None if no joint state had it."""
+        return self._base_poses.get((hand, key))
 
     def statistics(self, now_ns: int) -> dict[str, Any]:
         """Return the counters for the `service` message."""
@@ -206,8 +206,9 @@ class InputReceiver:
         problems = states.pop_problems()
         for cause, text in problems:
             self._drops.add(cause, f"{topic}: {text}", now_ns)
-        if kept and message.gravity is not None:
-            self._gravity_by_hand[message.hand] = message.gravity
+        for key in ("gravity", "orientation"):
+            if kept and (pose := getattr(message, key)) is not None:
+                self._base_poses[message.hand, key] = pose
         if not kept and states.late_count > late:
             self._drops.add("late", topic, now_ns)
         elif not kept and not problems:

@@ -1,6 +1,6 @@
 """Metrics for Prometheus: passes the daemon's messages to an HTTP server process, which answers scrapes.
 
-Public name: `MetricsExporter`.
+Public names: `MetricsExporter`, `METRICS_PATH`.
 
 The server is a process because a thread would hold the interpreter lock when the tick needs it. A scrape
 costs the tick nothing, and if the daemon hangs, handtouch_up becomes 0.
@@ -18,6 +18,7 @@ import threading
 from handtouch import wire
 from handtouch.daemon.endpoints import EndpointError
 
+METRICS_PATH = "/metrics"
 _RESTART_DELAY_S = 2.0
 _log = logging.getLogger("handtouch.metrics")
 

@@ -1,6 +1,6 @@
 """Prometheus text page from the daemon's `service` and `health` messages.
 
-Public names: `render_metrics`, `CONTENT_TYPE`, `METRICS_PATH`.
+Public names: `render_metrics`, `CONTENT_TYPE`.
 """
 
 from __future__ import annotations
@@ -15,13 +15,17 @@ from handtouch.daemon.stage_timer import FIRST_BUCKET_NS
 from handtouch.wire.health import CalibrationStateName
 from handtouch.wire.service import BusStatistics
 
-METRICS_PATH = "/metrics"
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _CALIBRATION_STATES = [state for state in typing.get_args(CalibrationStateName) if state]
 _BUS_STATES = typing.get_args(typing.get_type_hints(BusStatistics)["state"])
 _TRAFFIC_COUNTERS = ("frames", "sent", "bits", "samples")
 _ERROR_COUNTERS = (
-    *("wrong_length", "unknown_frames", "error_frames", "send_failures", "queue_full", "receive_failures"),
+    "wrong_length",
+    "unknown_frames",
+    "error_frames",
+    "send_failures",
+    "queue_full",
+    "receive_failures",
     "overflow",
 )
 _JITTER_QUANTILES = {"p50": "0.5", "p99": "0.99", "max": "1"}

@@ -16,7 +16,8 @@ import time
 from http import HTTPStatus
 
 from handtouch import wire
-from handtouch.daemon.metrics_page import CONTENT_TYPE, METRICS_PATH, render_metrics
+from handtouch.daemon.metrics import METRICS_PATH
+from handtouch.daemon.metrics_page import CONTENT_TYPE, render_metrics
 from handtouch.host.http_server import BoundedHttpServer, BoundedRequestHandler
 
 _MAX_PACKET_BYTES = 1 << 20

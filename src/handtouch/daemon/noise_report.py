@@ -29,7 +29,7 @@ class NoiseReport:
     def find(self, tick: TickProcessor) -> list[bool]:
         """Return which pads have raised thresholds, or more noise than is accepted."""
         too_much = _measured(tick).max(axis=1) > self._ratio * tick.model.noise_counts
-        noisy: list[bool] = (too_much | (tick.baseline.threshold_factor > 1.0)).tolist()
+        noisy: list[bool] = (too_much | (tick.baseline.noise_factor > 1.0)).tolist()
         return noisy
 
     def update(
@@ -39,7 +39,7 @@ class NoiseReport:
         if not noisy:
             self._since_ns[pad], self._ratio[pad] = None, MAX_NOISE_RATIO
             return None
-        model, factor = tick.model, float(tick.baseline.threshold_factor[pad])
+        model, factor = tick.model, float(tick.baseline.noise_factor[pad])
         measured = _measured(tick)[pad, : int(model.electrode_counts[pad])]
         worst, stated = float(measured.max()), float(model.noise_counts[pad])
         self._ratio[pad] = _END_RATIO * MAX_NOISE_RATIO

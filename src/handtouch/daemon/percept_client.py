@@ -23,7 +23,7 @@ from handtouch.core.stages.slip import SLIP_SLICES
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
-from handtouch.wire import PERCEPT_KINDS, ForceStatus, PadState, PositionStatus
+from handtouch.wire import PERCEPT_KINDS, ContactRadiusStatus, ForceStatus, PadState, PositionStatus
 
 IntArray = NDArray[np.intp]
 _IDLE_PERIOD_NS = 50_000_000
@@ -32,8 +32,16 @@ _STOP_DELAY_NS = 30_000_000_000
 """From the last request to the process' end: starting it takes a second"""
 _MAX_MESSAGES_PER_TICK = 2
 _VALUE_COLUMNS = (
-    *("xy", "pad_m", "pad_noise_m2", "position_m", "normal", "covariance_m2"),
-    *("force_n", "force_std_n", "residual", "residual_std"),
+    "xy",
+    "pad_m",
+    "pad_noise_m2",
+    "position_m",
+    "normal",
+    "covariance_m2",
+    "force_n",
+    "force_std_n",
+    "residual",
+    "residual_std",
 )
 _MOTION, _OBJECT = PERCEPT_KINDS.index("motion"), PERCEPT_KINDS.index("object")
 _log = logging.getLogger("handtouch.percept")
@@ -192,6 +200,7 @@ class PerceptClient:
             **fields,
             **self._palm_columns(rows),
             **self._shear_columns(rows),
+            **self._radius_columns(rows),
             **self._snapshot(hand, hand_rows, sync_ns),
         )
 
@@ -238,6 +247,19 @@ class PerceptClient:
             "force_vector_n": vector[:, :3].tobytes(),
             "force_vector_covariance_n2": vector[:, 3:].tobytes(),
         }
+
+    def _radius_columns(self, rows: IntArray) -> dict[str, Any]:
+        """Return radii by both sheets of a pad, NaN where there is none or its force isn't valid."""
+        tick = self._pipeline.tick
+        if not (tick.second.any_configured and len(rows)):
+            return {}
+        values = tick.columns.values[rows]
+        unusable = values[:, VALUE_SLICES["contact_radius_status"]][:, 0] != ContactRadiusStatus.VALID
+        unusable |= tick.columns.force_status[rows] != ForceStatus.VALID
+        found = {}
+        for name in ("contact_radius_m", "contact_radius_std_m"):
+            found[name] = np.where(unusable, np.nan, values[:, VALUE_SLICES[name]][:, 0]).tobytes()
+        return found
 
     def _handle_message(self, data: bytes) -> None:
         try:

@@ -139,15 +139,19 @@ def find_changes(old: Deployment, new: Deployment) -> tuple[dict[int, list[str]]
     for number, (before, after) in enumerate(pairs):
         what = _changed_keys(before, after)
         what += [f"node.{after.node}"] * (old.nodes[before.node] != new.nodes[after.node])
-        what += [f"sheet.{after.sheet}"] * (old.sheets[before.sheet] != new.sheets[after.sheet])
+        sheets = old.sheets.get(before.sheet), new.sheets.get(after.sheet)
+        what += [f"sheet.{after.sheet}"] * (sheets[0] != sheets[1])
+        seconds = old.sheets.get(before.second_sheet), new.sheets.get(after.second_sheet)
+        if seconds[0] != seconds[1] and before.second_sheet == after.second_sheet:
+            what.append(f"sheet.{after.second_sheet}")
         shears = old.shears.get(before.shear), new.shears.get(after.shear)
         what += [f"shear.{after.shear}"] * (shears[0] != shears[1])
-        if (before.touch or old.touch) != (after.touch or new.touch) and "touch" not in what:
+        if old.touch_of(before) != new.touch_of(after) and "touch" not in what:
             what.append("touch")
         if what:
             pads[number] = what
     tables = [name for name in ("daemon", "scene", "touch") if getattr(old, name) != getattr(new, name)]
-    for name in ("nodes", "sheets", "shears", "objects"):
+    for name in ("nodes", "sheets", "responses", "shears", "objects"):
         before_all, after_all = getattr(old, name), getattr(new, name)
         keys = sorted(before_all.keys() | after_all.keys())
         tables += [f"{name[:-1]}.{key}" for key in keys if before_all.get(key) != after_all.get(key)]

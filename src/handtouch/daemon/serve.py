@@ -17,8 +17,7 @@ from pathlib import Path
 from handtouch.canbus.nodes.spec import check_nodes
 from handtouch.config import Deployment, load
 from handtouch.daemon.daemon import HandtouchDaemon
-from handtouch.daemon.metrics import MetricsExporter
-from handtouch.daemon.metrics_page import METRICS_PATH
+from handtouch.daemon.metrics import METRICS_PATH, MetricsExporter
 from handtouch.hand.robot_models import drop_invalid_urdfs
 from handtouch.host import logs, realtime
 from handtouch.host.signals import stop_on_signals

@@ -15,8 +15,17 @@ FIRST_BUCKET_NS = 1024
 _BUCKET_COUNT = 64  # enough for any int64 of nanoseconds, so that adding needs no check
 
 STAGES = (
-    *("sync", "wait", "receive", "tick", "send", "percepts", "settle", "supervise"),
-    *("nodes", "report", "requests"),
+    "sync",
+    "wait",
+    "receive",
+    "tick",
+    "send",
+    "percepts",
+    "settle",
+    "supervise",
+    "nodes",
+    "report",
+    "requests",
 )
 """Stages of a period, in order: send SYNC; wait for the bus; receive frames; compute contacts; send messages;
 compute percepts; prepare the next tick; exchange data with the supervisor process; poll nodes and buses;

@@ -1,6 +1,6 @@
 """Status of the daemon and its pads: health and service messages, and the reply to `status`.
 
-Public name: `StatusReporter`.
+Public names: `StatusReporter`, `Buses`, `Statistics`, `Workers`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from handtouch.canbus.nodes.spec import ErrorChanged, MasterEvent, NodeEvent
 from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
-from handtouch.core.stages.shear import SHEAR_CHANNELS
+from handtouch.core.stages.rows import SHEAR_CHANNELS
 from handtouch.daemon.noise_report import NoiseReport
 from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.percept_client import PerceptClient
@@ -34,7 +34,13 @@ from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.shear_channels import ShearChannels
 from handtouch.daemon.stage_timer import StageTimer
 from handtouch.daemon.supervisor_client import SupervisorClient
-from handtouch.wire import AdaptationStatusName, NodeStateName, PadState, ShearStatusName
+from handtouch.wire import (
+    AdaptationStatusName,
+    NodeStateName,
+    PadState,
+    SecondSheetStatusName,
+    ShearStatusName,
+)
 
 _SECOND_NS = 1_000_000_000
 _MAX_SUBSCRIPTIONS = 100  # in `service`
@@ -66,45 +72,61 @@ _PAD_STATE_OF_NODE_STATE = {
 }
 
 
+class Buses(NamedTuple):
+    """Master of all buses, and their ports by name."""
+
+    master: Master
+    ports: Mapping[str, Port]
+    sync: Sync
+
+
+class Statistics(NamedTuple):
+    """Functions that return numbers from elsewhere in the daemon."""
+
+    wall_offset_ns: Callable[[], int]
+    """difference of wall clock and monotonic clock"""
+    process: Callable[[], dict[str, Any]]
+    """resource usage of this process"""
+    refusals: Callable[[], Mapping[str, int]]
+    """refused connections and requests by cause"""
+    inputs: Callable[[int], dict[str, Any]]
+    """counters of the inputs endpoint at a time [ns]"""
+
+
+class Workers(NamedTuple):
+    """Processes beside the daemon's, where they are configured."""
+
+    supervisor: SupervisorClient | None = None
+    percepts: PerceptClient | None = None
+
+
 class StatusReporter:
     """Reports on pipeline, master, buses and publisher; `poll` it after every tick.
 
     It also maintains the pipeline's `node_state`, the pad state that follows from each node's state.
-    `refusals` returns refused connections and requests by cause, `input_statistics` the counters of the
-    inputs endpoint at a time [ns], `process_statistics` the resource usage of this process, `wall_offset_ns`
-    the difference of wall clock and monotonic clock. `on_message` gets every message, subscribed or not.
+    `on_message` gets every message, subscribed or not.
     """
 
     def __init__(
         self,
         deployment: Deployment,
         pipeline: Pipeline,
-        master: Master,
-        ports: Mapping[str, Port],
-        sync: Sync,
+        buses: Buses,
         publisher: Publisher,
         *,
         started_ns: int,
-        wall_offset_ns: Callable[[], int],
-        process_statistics: Callable[[], dict[str, Any]],
-        refusals: Callable[[], Mapping[str, int]],
-        input_statistics: Callable[[int], dict[str, Any]],
-        supervisor: SupervisorClient | None = None,
-        percepts: PerceptClient | None = None,
+        statistics: Statistics,
+        workers: Workers,
         on_message: Callable[[wire.Health | wire.Service], None] | None = None,
     ) -> None:
         n = pipeline.model.size
         self._deployment = deployment
         self._pipeline = pipeline
-        self._master = master
-        self._ports = ports
-        self._sync = sync
+        self._master, self._ports, self._sync = buses
         self._publisher = publisher
-        self._wall_offset_ns, self._process_statistics = wall_offset_ns, process_statistics
-        self._refusals, self._input_statistics = refusals, input_statistics
-        self.percepts = percepts
+        self._statistics = statistics
+        self.supervisor, self.percepts = workers
         self._on_message = on_message
-        self.supervisor = supervisor
         self._pads = deployment.pads
         self._names = [(hand, pad.link) for hand, pad in self._pads]
         self._topics = [f"health/{hand}/{link}" for hand, link in self._names]
@@ -125,10 +147,12 @@ class StatusReporter:
         self._rates_hz: dict[str, float] = {}
         self._rejected_adaptation = np.zeros(n, dtype=np.bool_)
         self._shear_channels = ShearChannels()
+        self._second_sheet: dict[int, SecondSheetStatusName] = {}
+        """status of pads' second sheets under the last touch"""
         self._noise = NoiseReport(len(self._pads))
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
-        self._logged_problems = dict.fromkeys(ports, "")  # last problem of each bus, without digits
+        self._logged_problems = dict.fromkeys(buses.ports, "")  # last problem of each bus, without digits
 
     def record_tick(self, from_ns: int, to_ns: int) -> None:
         """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`."""
@@ -378,8 +402,22 @@ class StatusReporter:
             error_history=status.error_history,
             adaptation_status=self._adaptation_status(pad) if columns.modelled[pad] else "",
             shear_status=self._shear_status(pad, touched=state == PadState.TOUCHED),
+            second_sheet_status=self._second_sheet_status(pad, touched=state == PadState.TOUCHED),
             **assessment,
         )
+
+    def _second_sheet_status(self, pad: int, *, touched: bool) -> SecondSheetStatusName:
+        """Return the status of a pad's second sheet; what only touches show is kept until the next touch."""
+        tick = self._pipeline.tick
+        if not tick.second.has_second(pad):
+            return ""
+        counts = tick.channel_counts
+        status = tick.second.find_status(pad, counts, self._pipeline.slab.saturated(counts))
+        if not touched and status == "operational":
+            return self._second_sheet.get(pad, "operational")
+        if touched:
+            self._second_sheet[pad] = status
+        return status
 
     def _adaptation_status(self, pad: int) -> AdaptationStatusName:
         return "rejected" if self._rejected_adaptation[pad] else "compensated"
@@ -409,7 +447,7 @@ class StatusReporter:
             session=self._publisher.session,
             seq=self._service_seq,
             t_ns=now_ns,
-            wall_offset_ns=self._wall_offset_ns(),
+            wall_offset_ns=self._statistics.wall_offset_ns(),
             version=__version__,
             pid=os.getpid(),
             uptime_s=(now_ns - self._started_ns) * 1e-9,
@@ -422,8 +460,8 @@ class StatusReporter:
             tick_us=self._tick_us,
             loop=self.stage_timer.statistics(),
             contacts=self._pipeline.tick.contacts.begun_count,
-            rejected=dict(self._refusals()),
-            process=self._process_statistics(),
+            rejected=dict(self._statistics.refusals()),
+            process=self._statistics.process(),
             buses={
                 name: {
                     "load": self._rates_hz.get(f"{name} bits", 0.0) / bit_rates[name],
@@ -441,7 +479,7 @@ class StatusReporter:
             retained=False,
             supervisor=self.supervisor.statistics() if self.supervisor is not None else None,
             percepts=self.percepts.statistics() if self.percepts is not None else None,
-            inputs=self._input_statistics(now_ns),
+            inputs=self._statistics.inputs(now_ns),
             frame_period_s=self._frame_period_ns() * 1e-9,
         )
 

@@ -240,7 +240,7 @@ class SupervisorClient:
             touching,
             self._needed_pads,
             sheet_force.back_force[0],
-            self._pipeline.model.begin_threshold_n,
+            self._pipeline.model.touch.begin_threshold_n,
         ):
             return
         self._pipeline.add_event(ExcitationEvent(tuple((~schedule.off).tolist())))
@@ -271,7 +271,7 @@ class SupervisorClient:
             count = self._channels(pad)
             covariance = self._pipeline.model.gain_covariance[pad, :count, :count]
         calibration = self._pipeline.calibrations[pad]
-        law = calibration.law
+        law, second = calibration.law, calibration.second_law
         message = CalibrationUpdate(
             pad=pad,
             serial=serial,
@@ -281,6 +281,7 @@ class SupervisorClient:
             parts=self._parts[pad],
             offset_counts=channel_values(offset_counts) if offset_counts is not None else None,
             law=ContactLawMessage(**asdict(law)) if law is not None and "law" in given else None,
+            second_law=ContactLawMessage(**asdict(second)) if second is not None and "law" in given else None,
         )
         if {"gains", "law"} & given:  # the supervisor process confirms these
             self._unconfirmed_calibrations[pad] = message.calibration_id
@@ -359,13 +360,21 @@ class SupervisorClient:
         elif pad not in self._unconfirmed_calibrations:  # newer knowledge replaces manual settings
             self._manual_parts.pop(pad, None)
         before = pipeline.calibrations[pad]
-        law = pipeline.model.default_calibration(pad).law if message.new_sheet else before.law
-        if message.law is not None:
-            law = LawParameters(**message.law.model_dump())
+        kept = pipeline.model.default_calibration(pad) if message.new_sheet else before
+        laws = [
+            own if new is None else LawParameters(**new.model_dump())
+            for own, new in ((kept.law, message.law), (kept.second_law, message.second_law))
+        ]
         self._log_gain_covariance[pad], self._parts[pad] = None, message.parts
         if message.covariance is not None:
             self._log_gain_covariance[pad] = np.reshape(message.covariance, (len(message.gains), -1))
-        calibration = replace(before, calibration_id=message.calibration_id, gains=message.gains, law=law)
+        calibration = replace(
+            before,
+            calibration_id=message.calibration_id,
+            gains=message.gains,
+            law=laws[0],
+            second_law=laws[1],
+        )
         self._set_calibration(pad, calibration, before.quarantined)
         if message.new_sheet:
             pipeline.add_event(ReplacementEvent(pad))
@@ -431,7 +440,7 @@ class SupervisorClient:
             kind=FaultKind.SHEET_ADAPTED,
             cause="sheet has adapted to load",
             evidence=f"{back_n:.2f} N hidden, contacts begin at "
-            f"{self._pipeline.model.begin_threshold_n[pad]:.2f} N",
+            f"{self._pipeline.model.touch.begin_threshold_n[pad]:.2f} N",
             remedy="excitation is off and no contact is detected: touch another pad to switch it on",
             since_ns=self._pipeline.cycle.sync_ns,
         )

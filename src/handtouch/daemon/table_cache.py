@@ -25,7 +25,7 @@ from handtouch.config import Deployment
 from handtouch.core import pad_tables
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import ForwardTable
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 
 MAX_CACHE_BYTES = 256 << 20
 """Tables used least recently are removed beyond that; 130 distinct pads of four electrodes."""
@@ -53,7 +53,7 @@ class TableCache:
         self._folder, self._max_bytes = folder, max_bytes
         self._is_writable = True  # until writing failed
 
-    def forward_table(self, network: ElectrodeNetwork) -> ForwardTable:
+    def forward_table(self, network: ChannelModel) -> ForwardTable:
         """Return the forward table of a pad, from the cache or computed."""
         file = self._folder / f"{_table_key(network)}{_ENDING}"
         table = self._read_table(file)
@@ -111,7 +111,7 @@ class TableCache:
                 file.unlink(missing_ok=True)
 
 
-def _table_key(network: ElectrodeNetwork) -> str:
+def _table_key(network: ChannelModel) -> str:
     """Return the hash of everything that a table depends on."""
     parameters = (
         network.a,
@@ -120,7 +120,7 @@ def _table_key(network: ElectrodeNetwork) -> str:
         network.sheet_ohm_per_square,
         network.series_ohm,
         network.states,
-        network.film_digest,
+        network.digest,
         np.__version__,
         _code_hash(),
     )

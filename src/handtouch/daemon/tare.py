@@ -17,7 +17,7 @@ from handtouch.core.events import BaselineEvent
 from handtouch.core.least_threshold import begin_samples, least_begin_counts, level_scatter
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
-from handtouch.core.stages.shear import SHEAR_CHANNELS
+from handtouch.core.stages.rows import SHEAR_CHANNELS
 from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.shear_channels import ShearChannels
 from handtouch.wire import PadState
@@ -58,8 +58,8 @@ class TareJob:
         self._touched = np.zeros(len(names), dtype=np.bool_)
         self._levels: list[list[int]] = [[] for _ in names]
         """sums of the channels of each pad's samples"""
-        self._shear_sum = np.zeros((len(names), SHEAR_CHANNELS))
-        self._shear_saturated = np.zeros((len(names), SHEAR_CHANNELS), dtype=np.bool_)
+        self._all_sum = np.zeros(tick.channel_counts.shape)
+        self._saturated = np.zeros(tick.channel_counts.shape, dtype=np.bool_)
         pacer.request_full_rate(selected, now_ns)
 
     def poll(self, now_ns: int) -> dict[str, Any] | None:
@@ -76,10 +76,8 @@ class TareJob:
             self._levels[pad].append(int(tick.counts[pad].sum()))
         # a load since the start, of unknown zeros, is what the user says it is: none
         self._touched |= tick.contacts.touching & tick.state.known
-        shear = tick.channel_counts[:, tick.model.channels :]
-        self._shear_sum[:, : shear.shape[1]] += shear * new[:, None]
-        saturated = self._pipeline.slab.saturated(tick.channel_counts)[:, tick.model.channels :]
-        self._shear_saturated[:, : shear.shape[1]] |= saturated & new[:, None]
+        self._all_sum += tick.channel_counts * new[:, None]
+        self._saturated |= self._pipeline.slab.saturated(tick.channel_counts) & new[:, None]
         if now_ns < self._end_ns:
             return None
         return {"pads": [self._finish_pad(pad, tick.model) for pad in np.flatnonzero(selected).tolist()]}
@@ -108,23 +106,33 @@ class TareJob:
         offsets, spread = tuple(mean.tolist()), tuple((std / np.sqrt(count)).tolist())
         at_rest: tuple[float, ...] = ()
         if self._tick.shear.has_shear(pad):
-            at_rest = tuple((self._shear_sum[pad] / count).tolist())
-        self._pipeline.add_event(BaselineEvent(pad, offsets, spread, at_rest))
+            at_rest = tuple((self._all_sum[pad, self._shear_columns(pad)] / count).tolist())
+        second: tuple[float, ...] = ()
+        if self._tick.second.has_second(pad):
+            mean_count = float(self._all_sum[pad, self._tick.second.column(pad)]) / count
+            second = mean_count, float(model.noise_counts[pad]) / math.sqrt(count)
+        self._pipeline.add_event(BaselineEvent(pad, offsets, spread, at_rest, second))
         self._on_tared(pad, offsets)
         return {
             **result,
             "tared": True,
             "reason": "",
             "offset_counts": mean.tolist(),
-            "begin_threshold_n": float(model.begin_threshold_n[pad]),
+            "second_offset_counts": second[0] if second else None,
+            "begin_threshold_n": float(model.touch.begin_threshold_n[pad]),
             "least_begin_threshold_n": self._least_begin_n(pad, model),
         }
+
+    def _shear_columns(self, pad: int) -> slice:
+        """Return the columns of the channels of the shear pad beneath a pad."""
+        first = next(shear.column for shear in self._tick.model.shear_pads if shear.pad == pad)
+        return slice(first, first + SHEAR_CHANNELS)
 
     def _least_begin_n(self, pad: int, model: PadModel) -> float | None:
         """Return the least threshold of a pad by its noise now and its drift so far [N]; None for too few
         samples."""
         period_ns = self._pipeline.cycle.period_ns
-        count = begin_samples(int(model.begin_debounce_ns[pad]), period_ns)
+        count = begin_samples(float(model.touch.begin_ms[pad]), period_ns)
         noise = level_scatter(np.array(self._levels[pad], np.float64), count)
         lag = TRACKING_TIME_S * float(self._tick.baseline.drift_speed[pad])
         least = least_begin_counts(math.hypot(noise, lag), 1e9 / period_ns)
@@ -138,9 +146,13 @@ class TareJob:
             return "touched during the measurement; remove the load and tare again"
         noise = float(model.noise_counts[pad])
         if self._tick.shear.has_shear(pad):
+            columns = self._shear_columns(pad)
             status = ShearChannels().update(
-                *(pad, 0, np.rint(self._shear_sum[pad] / self._count[pad]).astype(np.int64)),
-                *(self._shear_saturated[pad], noise),
+                pad,
+                0,
+                np.rint(self._all_sum[pad, columns] / self._count[pad]).astype(np.int64),
+                self._saturated[pad, columns],
+                noise,
                 touched=False,
                 rest_known=True,
             )

@@ -77,7 +77,7 @@ class PadTask:
         name = pad_design(deployment, link).name
         entry = next(entry for entry in deployment.pads if entry.pad.link == name)
         pad = entry.pad
-        node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+        node, sheet = deployment.nodes[pad.node], deployment.sheet_of(pad)
         tolerances = PartTolerances() if nominal else PartTolerances.from_tables(pad, node, sheet)
         return cls(deployment, entry.hand, pad, force_n, tolerances)
 
@@ -108,7 +108,7 @@ class PadTask:
     @property
     def sheet(self) -> config.Sheet:
         """Table of its sheet."""
-        return self.deployment.sheets[self.pad.sheet]
+        return self.deployment.sheet_of(self.pad)
 
     @cached_property
     def noise_a(self) -> float:

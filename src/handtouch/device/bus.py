@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from handtouch.canbus import cia301
 from handtouch.config import shipped
-from handtouch.device.inputs import CHANNELS, MAX_CHANNELS
+from handtouch.config.base import MAX_CHANNELS
+from handtouch.device.inputs import CHANNELS
 from handtouch.device.lss import StoreId
 from handtouch.device.node import NMT_COMMANDS, RESETS, Device
 from handtouch.device.object_values import Address
@@ -89,8 +90,7 @@ class DeviceBus:
         node_id: int,
         *,
         eds: Path | str | None = None,
-        vendor_id: int | None = None,
-        product_code: int | None = None,
+        kind: tuple[int | None, int | None] = (None, None),
         serial: int | None = None,
         channels: tuple[Address, ...] = ANALOGUE_INPUTS,
         counts_per_unit: tuple[float | None, ...] | None = None,
@@ -99,8 +99,8 @@ class DeviceBus:
     ) -> Device:
         """Add a node on the next row of `sample`; it is silent until `Device.plug` or `start`.
 
-        `eds` : by default the one shipped with handtouch, for 4 or 16 channels
-        `vendor_id`, `product_code`, `serial` : by default those of the EDS
+        `eds` : by default the one shipped with handtouch, for 4 or 32 channels
+        `kind` (vendor id, product code), `serial` : by default those of the EDS
         `channels` : the objects (index, sub-index) of the channels
         `counts_per_unit` : channels that are REAL32 carry the count divided by this, by default by 1
         `excitation` : the object that switches the sheet's excitation, by default 0x2100 if it has that name
@@ -113,11 +113,16 @@ class DeviceBus:
         """
         if not 1 <= node_id <= 127 or node_id in self.devices:
             raise ValueError(f"node_id must be 1 to 127 and used once, got {node_id}")
+        vendor_id, product_code = kind
         spec = DeviceSpec(
             _eds_path(eds, len(channels)),
-            *(vendor_id, product_code, serial, channels),
-            counts_per_unit or (None,) * len(channels),
-            *(excitation, strict_pdo),
+            vendor_id=vendor_id,
+            product_code=product_code,
+            serial=serial,
+            channels=channels,
+            counts_per_unit=counts_per_unit or (None,) * len(channels),
+            excitation=excitation,
+            strict_pdo=strict_pdo,
         )
         device = Device(self, self._rows, node_id, spec)
         self._rows += 1
@@ -138,8 +143,7 @@ class DeviceBus:
         self,
         *,
         eds: Path | str | None = None,
-        vendor_id: int | None = None,
-        product_code: int | None = None,
+        kind: tuple[int | None, int | None] = (None, None),
         serial: int | None = None,
         channels: tuple[Address, ...] = ANALOGUE_INPUTS,
         lss_compares: bool = True,
@@ -148,7 +152,7 @@ class DeviceBus:
 
         `lss_compares` : as `LssSlave.compares`
         """
-        spec = DeviceSpec(_eds_path(eds), vendor_id, product_code, serial, channels)
+        spec = DeviceSpec(_eds_path(eds), *kind, serial, channels)
         return self._append_lss_device(UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares))
 
     def add_stored(
@@ -162,7 +166,11 @@ class DeviceBus:
             raise ValueError(f"node_id must be used once, got {node_id}")
         addresses = tuple((cia301.ANALOGUE_INPUTS, sub + 1) for sub in range(channels))
         spec = DeviceSpec(
-            *(_eds_path(None, channels), None, None, serial, addresses),
+            _eds_path(None, channels),
+            None,
+            None,
+            serial,
+            addresses,
             counts_per_unit=(None,) * channels,
             simulates_excitation=False,
         )
@@ -411,5 +419,5 @@ class DeviceBus:
 
 
 def _eds_path(eds: Path | str | None, channels: int = CHANNELS) -> str:
-    name = "handtouch-node.eds" if channels <= CHANNELS else "handtouch-node-16.eds"
+    name = "handtouch-node.eds" if channels <= CHANNELS else "handtouch-node-32.eds"
     return str(eds or shipped.path(name))

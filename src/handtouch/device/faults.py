@@ -10,7 +10,8 @@ from typing import Any, Generic, TypeVar
 
 import can
 
-from handtouch.device.inputs import CHANNELS, MAX_CHANNELS, STRAIGHT_WIRING
+from handtouch.config.base import MAX_CHANNELS
+from handtouch.device.inputs import CHANNELS, STRAIGHT_WIRING
 
 T = TypeVar("T")
 

@@ -6,8 +6,9 @@ import random
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
 
+from handtouch.config.base import MAX_CHANNELS
+
 CHANNELS = 4
-MIN_CHANNELS, MAX_CHANNELS = 3, 16
 STRAIGHT_WIRING = tuple(range(MAX_CHANNELS))
 SETTLE_SAMPLES = 3
 """Number of wrong samples after the excitation is switched on."""

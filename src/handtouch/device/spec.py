@@ -8,9 +8,10 @@ from canopen import ObjectDictionary
 
 from handtouch.canbus import cia301
 from handtouch.config import eds
+from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS
 from handtouch.config.channels import integer_limits
 from handtouch.config.eds import REAL32
-from handtouch.device.inputs import CHANNELS, MAX_CHANNELS, MIN_CHANNELS, ChannelLimits
+from handtouch.device.inputs import CHANNELS, ChannelLimits
 from handtouch.device.object_values import Address, ObjectValues
 
 ANALOGUE_INPUTS: tuple[Address, ...] = tuple((cia301.ANALOGUE_INPUTS, sub) for sub in (1, 2, 3, 4))
@@ -22,7 +23,7 @@ _DEFAULT_EXCITATION = (0x2100, 0)
 class DeviceSpec:
     """Kind and identity of a node; identity fields that are None are those of the EDS.
 
-    `channels` : the objects of the channels, at most 16
+    `channels` : the objects of the channels, at most 32
     `counts_per_unit` : those that are REAL32 carry the count divided by this
     `excitation` : the object that switches the excitation, None for 0x2100 if it has that name in the EDS
     `strict_pdo` : a valid PDO can't be changed

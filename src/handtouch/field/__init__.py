@@ -31,7 +31,6 @@ from handtouch.field.surface import (
 
 if TYPE_CHECKING:
     from handtouch.field.residual import PointTest, point_test, resolvable_separation
-    from handtouch.field.sandwich import Sandwich, SandwichEstimate
 
 __all__ = [
     "AnisotropicSurface",
@@ -54,8 +53,6 @@ __all__ = [
     "PrismSurface",
     "Rectangle",
     "RevolutionSurface",
-    "Sandwich",
-    "SandwichEstimate",
     "SphereSurface",
     "Surface",
     "contact_stack_resistance",
@@ -64,10 +61,7 @@ __all__ = [
     "resolvable_separation",
 ]
 
-_LATER = {
-    **dict.fromkeys(("PointTest", "point_test", "resolvable_separation"), "residual"),
-    **dict.fromkeys(("Sandwich", "SandwichEstimate"), "sandwich"),
-}
+_LATER = dict.fromkeys(("PointTest", "point_test", "resolvable_separation"), "residual")
 """Names that load their module when they are used: the daemon needs none of them"""
 
 

@@ -1,7 +1,6 @@
 """Contact law: total current to force and back, through the sheet and a pressure-dependent contact.
 
-Public names: `contact_stack_resistance`, `ContactLaw`, `ForceEstimate`, `ForceEstimateStatus`; two sheets in
-one sandwich are in `handtouch.field.sandwich`.
+Public names: `contact_stack_resistance`, `ContactLaw`, `ForceEstimate`, `ForceEstimateStatus`.
 
 A contact of radius A meets three resistances in series: the pressed layer and the sheet under it, eq. 11; the
 sheet from there to the electrodes, sheet / (2 pi) ln(R / A) with R the conformal or spreading radius at its

@@ -34,7 +34,8 @@ def read_embedded(name: str) -> bytes:
             return Path(name).read_bytes()
         except OSError as error:
             raise ValueError(
-                f"{error.strerror or error}; give its path relative to the folder of the deployment file"
+                f"{error.strerror or error}: {name}; give its path relative to the folder of the deployment "
+                "file"
             ) from error
     try:
         return zlib.decompress(base64.b64decode(name.removeprefix(_PREFIX), validate=True))

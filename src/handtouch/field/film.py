@@ -24,7 +24,6 @@ from handtouch.field.network import ElectrodeEnd, ElectrodeNetwork
 from handtouch.field.surface_base import FloatArray, Surface
 
 MIN_SPOTS = 4
-_GRID_POINTS = 100  # of a surface along each side, among which the nearest to a measured place is taken
 _END_CELLS, _CELLS = 8, 56  # least between two ends of electrodes, and of a whole side
 _SMOOTHING = 1e-6  # of a thin plate, over the spots' own scatter: measured places that nearly coincide
 _RADIUS_NODES = 9
@@ -69,16 +68,7 @@ class Film:
 
     def fractions(self, surface: Surface) -> FloatArray:
         """Return the places as fractions (n, 2) of a surface's rectangle."""
-        if self.place_m.shape[1] == 2:
-            x, y = surface.to_rectangle(*self.place_m.T)
-            return np.stack([x / surface.a, y / surface.b], axis=1)
-        from scipy.spatial import cKDTree  # not loaded with the package
-
-        axes, origin = surface.frame
-        way = np.linspace(0, 1, _GRID_POINTS)
-        at = np.stack(np.meshgrid(way, way), axis=-1).reshape(-1, 2)
-        points = surface.point(surface.a * at[:, 0], surface.b * at[:, 1]).T
-        return np.asarray(at[cKDTree(points).query((self.place_m - origin) @ axes)[1]])
+        return surface.fractions_of_places(self.place_m)
 
     def log_ratio(self, surface: Surface, nominal_ohm: float) -> _Plate:
         """Return the logarithm of the sheet resistance over its nominal value, on the rectangle."""
@@ -140,7 +130,7 @@ class UnevenNetwork(ElectrodeNetwork):
         return network
 
     @property
-    def film_digest(self) -> str:
+    def digest(self) -> str:
         return self._change.digest
 
     @property

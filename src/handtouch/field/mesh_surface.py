@@ -260,8 +260,7 @@ def _map_to_rectangle(surface: Triangulation, corners: IntArray, known: int) -> 
     a = float(np.sqrt(_areas(surface).sum() * ratio))
     b = a / float(ratio)
     places = np.stack([a * u, b * v], axis=1)
-    around = surface.points[np.append(ring, ring[0])]
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
+    lengths = surface.lengths_around(ring)
     along = [places[sides[0], 0], a + places[sides[1], 1]]
     along += [2 * a + b - places[sides[2], 0], 2 * (a + b) - places[sides[3], 1]]
     boundary = np.concatenate([*(side[:-1] for side in along[:3]), along[3]])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,12 +46,80 @@ class ForwardModel(FractionModel, Protocol):
         ...
 
 
-def spreading_radius(model: ForwardModel, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the radius in the sheet resistance ln(radius / A) / (2 pi): the conformal radius, enlarged by
-    gaps.
-    """
-    radius = getattr(model, "spreading_radius", None) or model.conformal_radius  # type: ignore[attr-defined]
-    return np.asarray(radius(x, y), dtype=np.float64)
+class ChannelModel(ForwardModel, Protocol):
+    """A `ForwardModel` with what tables, tolerances and diagnoses read of a pad: an `ElectrodeNetwork`, or a
+    `ChannelMap`."""
+
+    @property
+    def digest(self) -> str:
+        """Name of what isn't among the other parameters."""
+        ...
+
+    @property
+    def sheet_ohm_per_square(self) -> float:
+        """Sheet resistance."""
+        ...
+
+    @property
+    def is_potential(self) -> bool:
+        """Whether fractions are potentials of one sheet, harmonic, whose sum is 1."""
+        ...
+
+    @property
+    def states(self) -> tuple[tuple[int, ...], ...]:
+        """Channels that are connected in each state of a schedule; empty: all of them, always."""
+        ...
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """Ends of the electrodes, where fractions are singular; empty where they are smooth."""
+        ...
+
+    @property
+    def series_ohm(self) -> tuple[float, ...]:
+        """Series resistors (m,) from the channels to ground."""
+        ...
+
+    @property
+    def conductance(self) -> FloatArray:
+        """Currents between channels (m, m). Raises ValueError where there is none, or an infinite one."""
+        ...
+
+    @property
+    def centres(self) -> FloatArray:
+        """Mean position, or place of the greatest response, of each channel (m, 2)."""
+        ...
+
+    @property
+    def currents_per_ideal(self) -> FloatArray:
+        """Matrix (m, m) from the fractions without resistors to those measured."""
+        ...
+
+    @property
+    def series_quadratic_form(self) -> FloatArray:
+        """Matrix (m, m) of the form of measured fractions that gives `series_resistance`."""
+        ...
+
+    @property
+    def series_sensitivity(self) -> FloatArray:
+        """Matrix (m, m) of changes of the fractions by each resistor, per its channel's fraction."""
+        ...
+
+    def with_open_electrode(self, electrode: int) -> Self:
+        """Return the pad with one channel connected to nothing."""
+        ...
+
+    def spreading_radius(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return the radius in the sheet resistance to a contact, (...)."""
+        ...
+
+    def series_resistance(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return what resistors add to the resistance of a contact [ohm], (...)."""
+        ...
+
+    def variation_slopes(self, x: ArrayLike, y: ArrayLike) -> FloatArray:
+        """Return changes (waves, m, ...) of the fractions by each way in which all may be off together."""
+        ...
 
 
 def channel_noise(noise: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

@@ -24,6 +24,7 @@ from handtouch.field._electrodes import ElectrodePotentials
 from handtouch.field._series_resistors import GroundedElectrodes
 from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.rectangle import Location, Rectangle
+from handtouch.field.uneven_sheet import unevenness_slopes
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -38,6 +39,7 @@ _MAX_SETTLED_STEP = 1e-8  # step over a side; Newton's next step would be its sq
 _MIN_OBSERVABLE_FRACTION = 1e-12  # with both fractions smaller, a coordinate isn't observable
 _MIN_USED_FRACTION = 1e-5  # smaller ones are excluded where the opposite side has ten times as much
 _FRACTION_ROUNDING = 2e-15  # upper bound: smaller steps are rounding
+_PATCH_STEP = 0.02  # step of second differences, in sides: currents of a patch vary no faster
 _FRACTION_FLOOR = 1e-17  # start value where a fraction is rounding
 
 
@@ -73,6 +75,7 @@ class ElectrodeNetwork(GroundedElectrodes):
     Raises ValueError naming impossible sides, gaps, resistances or arrangements.
     """
 
+    is_potential = True
     states: tuple[tuple[int, ...], ...] = ()
     """Electrodes that are connected in each state of a schedule; empty: all of them, always."""
 
@@ -157,9 +160,13 @@ class ElectrodeNetwork(GroundedElectrodes):
         return network
 
     @property
-    def film_digest(self) -> str:
+    def digest(self) -> str:
         """Name of a film of varying sheet resistance; empty for an even one."""
         return ""
+
+    def variation_slopes(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return `unevenness_slopes`."""
+        return unevenness_slopes(self, x, y)
 
     @property
     def a(self) -> float:
@@ -228,6 +235,15 @@ class ElectrodeNetwork(GroundedElectrodes):
         """
         ideal, jacobian = self._ideal_with_jacobian(self._to_disc(x, y))
         return self._mixed(ideal), self._mixed(jacobian / self._unit)
+
+    def patch_slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives (m, ...) of the fractions by x x and by x y."""
+        half = _PATCH_STEP * self.a
+        x = np.clip(x, 1.01 * half, self.a - 1.01 * half)
+        y = np.clip(y, _PATCH_STEP * self.b, (1 - _PATCH_STEP) * self.b)
+        more, less = (self.fractions_with_jacobian(x + step, y)[1] for step in (half, -half))
+        by_x, by_y = np.moveaxis((more - less) / (2 * half), 1, 0)
+        return by_x, by_y
 
     def estimate(
         self, currents: npt.ArrayLike, noise: npt.ArrayLike, start: npt.ArrayLike | None = None

@@ -23,6 +23,7 @@ SURFACES: dict[str, type[Surface]] = {}
 
 MAX_SIMILAR_END_RATIO = 0.8
 """Ratio of the ends' lengths below which one is called the narrow end."""
+_NEAREST_POINTS = 100  # along each side, among which the nearest to a place is taken
 _SI_PER_UNIT = {"mm": 1e-3, "deg": math.pi / 180}
 
 
@@ -203,6 +204,27 @@ class Surface(ABC):
     @abstractmethod
     def to_rectangle(self, u: npt.ArrayLike, v: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return the rectangle coordinates x and y, shape (...), of the arc lengths (u, v) [m]."""
+
+    def fractions_of_places(self, place_m: FloatArray) -> FloatArray:
+        """Return places as fractions (n, 2) of the rectangle.
+
+        place_m: (n, 2) lengths along the surface, as `to_rectangle` takes them, or (n, 3) in the frame of the
+        surface's file.
+        """
+        if place_m.shape[1] == 2:
+            x, y = self.to_rectangle(*place_m.T)
+            return np.stack([x / self.a, y / self.b], axis=1)
+        from scipy.spatial import cKDTree  # not loaded with the package
+
+        axes, origin = self.frame
+        way = np.linspace(0, 1, _NEAREST_POINTS)
+        at = np.stack(np.meshgrid(way, way), axis=-1).reshape(-1, 2)
+        points = self.point(self.a * at[:, 0], self.b * at[:, 1]).T
+        wanted = (place_m - origin) @ axes
+        at = at[cKDTree(points).query(wanted)[1]]
+        x, y = self.a * at[:, 0], self.b * at[:, 1]
+        beside = (self.tangents(x, y) * (wanted.T - self.point(x, y))).sum(axis=1) / self.scales(x, y)
+        return np.asarray(np.clip(at + beside.T / (self.a, self.b), 0.0, 1.0))
 
     @abstractmethod
     def point(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:

@@ -79,7 +79,11 @@ class Triangulation:
     @cached_property
     def ring_lengths(self) -> FloatArray:
         """Lengths along the edge at the points of `ring`, from the first, and the whole (n + 1,)."""
-        around = self.points[np.append(self.ring, self.ring[0])]
+        return self.lengths_around(self.ring)
+
+    def lengths_around(self, ring: IntArray) -> FloatArray:
+        """Return the lengths along the edge at its points (n,), from the first, and the whole (n + 1,)."""
+        around = self.points[np.append(ring, ring[0])]
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
 
     def nearest_on_edge(self, points: npt.ArrayLike) -> FloatArray:
@@ -121,8 +125,7 @@ class Triangulation:
         numbers = []
         for length in np.asarray(lengths, np.float64).ravel().tolist():
             ring = np.roll(surface.ring, -int(np.flatnonzero(surface.ring == first)[0]))
-            around = surface.points[np.append(ring, first)]
-            ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
+            ends = surface.lengths_around(ring)
             at = length % whole
             k = int(np.abs(ends - at).argmin())
             if abs(ends[k] - at) <= _MERGED * whole:

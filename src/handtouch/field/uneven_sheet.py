@@ -10,12 +10,14 @@ integrated by parts, d needs phi itself only, which is bounded at the electrodes
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import FractionModel
 
 FloatArray = NDArray[np.float64]
 
@@ -24,7 +26,11 @@ UNEVEN_WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 _TERMS, _QUADRATURE_POINTS = 24, 64  # along each side
 
 
-def unevenness_slopes(network: ElectrodeNetwork, x: ArrayLike, y: ArrayLike) -> FloatArray:
+class _CachedModel(FractionModel, Hashable, Protocol):
+    """A `FractionModel` that results are kept for."""
+
+
+def unevenness_slopes(network: _CachedModel, x: ArrayLike, y: ArrayLike) -> FloatArray:
     """Return derivatives (waves, channels, ...) of the fractions at x, y by the amplitude of each wave."""
     number = np.arange(1, _TERMS + 1)[:, None] * math.pi
     s, t = np.broadcast_arrays(np.asarray(x) / network.a, np.asarray(y) / network.b)
@@ -39,7 +45,7 @@ class UnevenSheet:
     wave: index of `UNEVEN_WAVES`. amplitude: of the logarithm of the sheet resistance.
     """
 
-    def __init__(self, network: ElectrodeNetwork, wave: int, amplitude: float) -> None:
+    def __init__(self, network: _CachedModel, wave: int, amplitude: float) -> None:
         self._network, self._wave, self._amplitude = network, wave, amplitude
 
     @property
@@ -59,7 +65,7 @@ class UnevenSheet:
 
 
 @lru_cache(maxsize=64)
-def _sine_coefficients(network: ElectrodeNetwork) -> FloatArray:
+def _sine_coefficients(network: _CachedModel) -> FloatArray:
     """Return coefficients (waves, channels, terms, terms) of sin(m pi x / a) sin(n pi y / b)."""
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     at, weights = (nodes + 1) / 2, weights / 2

@@ -1,16 +1,19 @@
 """Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
 
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_network`,
-`models_with_other_parts`, `part_stds`, `part_limits`, `PadGeometry`, `LinkContacts`.
+Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_channels`,
+`pad_network`, `press_map`, `channel_gain_std`, `models_with_other_parts`, `part_stds`,
+`part_limits`, `PadGeometry`, `LinkContacts`.
 """
 
 from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
 from handtouch.hand.pads import (
     MountUncertainty,
+    channel_gain_std,
     electrode_network,
     models_with_other_parts,
     mount_transform,
     network_parameters,
+    pad_channels,
     pad_network,
     pad_surface,
     part_limits,
@@ -21,10 +24,12 @@ __all__ = [
     "LinkContacts",
     "MountUncertainty",
     "PadGeometry",
+    "channel_gain_std",
     "electrode_network",
     "models_with_other_parts",
     "mount_transform",
     "network_parameters",
+    "pad_channels",
     "pad_network",
     "pad_surface",
     "part_limits",

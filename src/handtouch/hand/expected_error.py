@@ -92,7 +92,7 @@ def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDes
     chosen = next((pad for pad in pads if link in (None, pad.link)), None)
     if chosen is None:
         raise ValueError(f"no pad on link {link}; known links: {', '.join(pad.link for pad in pads)}")
-    sheet, node = deployment.sheets[chosen.sheet], deployment.nodes[chosen.node]
+    sheet, node = deployment.sheet_of(chosen), deployment.nodes[chosen.node]
     return PadDesign(
         chosen.link,
         pad_surface(chosen),
@@ -101,5 +101,5 @@ def pad_design(deployment: config.Deployment, link: str | None = None) -> PadDes
         node.drive_v,
         node.full_scale_ma * 1e-3,
         node.noise_counts,
-        (chosen.touch or deployment.touch).begin_threshold_n,
+        deployment.touch_of(chosen).begin_threshold_n,
     )

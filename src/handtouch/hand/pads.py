@@ -1,8 +1,9 @@
 """Surface, electrodes and mount of a pad in SI units, from its table in the deployment.
 
-Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_network`, `electrode_network`,
-`models_with_other_parts`, `part_stds`, `part_limits`, `series_ohm_stds`, `metres_per_unit`,
-`relative_size_stds`, `log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
+Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_channels`, `pad_network`,
+`press_map`, `channel_gain_std`, `electrode_network`, `models_with_other_parts`, `part_stds`, `part_limits`,
+`series_ohm_stds`, `shape_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`,
+`rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -13,13 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.config.responses import ForceLaw, ResponseTable
+from handtouch.field.channel_map import VARIATIONS, ChangedMap, ChannelMap
 from handtouch.field.contact_law import ContactLaw
-from handtouch.field.model import FractionModel
+from handtouch.field.measured import MapPrior, MeasuredMap, PressTable
+from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
 _M_PER_MM = 1e-3
+_MAP_GAIN_STD = 1e-3  # drift of gains since a map was measured, of which they are part
 LEAD_STD_OHM = 20.0
 """Standard deviation of leads of silver ink, or of worn plugs, as contacts may find it: up to 35 ohm."""
 
@@ -58,13 +63,62 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> NDArray[np.float64]:
 
 
 def network_parameters(pad: config.Pad) -> tuple[object, ...]:
-    """Return what `pad_network` depends on, but for the sheet: pads with the same share a network."""
-    return pad.surface, pad.resistance_map, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
+    """Return what `pad_channels` depends on, but for the sheet: pads with the same share a network."""
+    parts = pad.surface, pad.response, pad.resistance_map, pad.press_map
+    return *parts, pad.arcs_mm, pad.gaps_mm, pad.series_ohm, pad.state_numbers
+
+
+def pad_channels(pad: config.Pad, sheet: config.Sheet, node: config.Node) -> ChannelModel:
+    """Return the pad's electrodes, or the map of its response, as its presses show them if there are any."""
+    if pad.press_map is not None:
+        return press_map(pad, sheet, node, config.presses_of(pad.press_map))
+    if isinstance(pad.response, ResponseTable):
+        return pad.response.build(pad_surface(pad))
+    return pad_network(pad, sheet)
+
+
+def press_map(pad: config.Pad, sheet: config.Sheet, node: config.Node, presses: PressTable) -> MeasuredMap:
+    """Return the map of a pad that presses at known places show, from what is stated of its parts on.
+
+    Raises ValueError for presses of other channels.
+    """
+    stated = pad.model_copy(update={"press_map": None})
+    theory = pad_channels(stated, sheet, node)
+    prior = MapPrior(
+        theory,
+        models_with_other_parts(theory, stated, node, sheet),
+        node.gain_std,
+        relative_size_stds(stated, sheet),
+    )
+    response = pad.response if isinstance(pad.response, ForceLaw) else None
+    radius_mm, std_mm, elongation = (
+        (response.contact_radius_mm, response.contact_radius_std_mm, response.contact_elongation_std)
+        if response
+        else (
+            math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm),
+            0.0,
+            sheet.contact_elongation_std,
+        )
+    )
+    sizes = _M_PER_MM * radius_mm, _M_PER_MM * std_mm, elongation
+    return MeasuredMap(pad_surface(pad), presses, prior, *sizes)
+
+
+def channel_gain_std(pad: config.Pad, node: config.Node) -> float:
+    """Return the standard deviation of the logarithm of a channel's gain, of what isn't in its map."""
+    if pad.press_map is None:
+        return node.gain_std
+    serial = config.presses_of(pad.press_map).serial
+    if None not in (serial, pad.serial) and serial != pad.serial:  # another node than was pressed
+        return node.gain_std
+    return min(_MAP_GAIN_STD, node.gain_std)
 
 
 def pad_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
     """Return the pad's electrodes on its rectangle, whether on its sides or on arcs of its outline, and with
-    their schedule if they are switched."""
+    their schedule if they are switched. Raises ValueError for a pad without electrodes."""
+    if pad.response:
+        raise ValueError(f"{pad.link}: has a response, and no electrodes")
     if not pad.arcs_mm:
         return electrode_network(pad, sheet)
     surface = pad_surface(pad)
@@ -129,13 +183,19 @@ def electrode_network(
 
 
 def models_with_other_parts(
-    nominal: ElectrodeNetwork, pad: config.Pad, node: config.Node, sheet: config.Sheet
+    nominal: ChannelModel, pad: config.Pad, node: config.Node, sheet: config.Sheet
 ) -> tuple[FractionModel, ...]:
     """Return models in each of which one part of the pad differs by one standard deviation; gains aside.
 
     In the order of `part_stds`; `nominal` itself, the pad's network, for parts without a tolerance.
     """
     stds, ohm = part_stds(pad, node, sheet), np.array(pad.series_ohm)
+    if isinstance(nominal, ChannelMap):
+        own = 2 * nominal.channels
+        changed = [ChangedMap(nominal, slot) for slot in range(own + VARIATIONS)]
+        others = [nominal] * (nominal.channels + 1)
+        return (*changed[:own], nominal, *changed[own:], *others)
+    assert isinstance(nominal, ElectrodeNetwork)
     models: list[FractionModel] = []
     gap_std_m = sheet.gap_std_mm * _M_PER_MM
     steps = gap_std_m / metres_per_unit(pad, nominal)
@@ -152,8 +212,11 @@ def part_stds(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[
 
     Gaps [mm] at both ends of each electrode; logarithms of the ratio of the sides, of the waves of the sheet
     resistance (`UNEVEN_WAVES`); each series resistor with its lead [ohm]; logarithm of the sheet resistance
-    beside these.
+    beside these. Of a response, those are multiples of what its parts are off by.
     """
+    if pad.press_map is not None or isinstance(pad.response, ResponseTable):
+        count = len(pad.electrode_names)
+        return (*(1.0,) * (2 * count), 0.0, *(1.0,) * VARIATIONS, *(0.0,) * (count + 1))
     count = len(pad.electrode_names)
     sheet_std = sheet.ohm_per_square_std if any(pad.series_ohm) else 0.0
     resistors = (*series_ohm_stds(pad, node).tolist(), sheet_std)
@@ -175,11 +238,22 @@ def part_limits(pad: config.Pad, node: config.Node) -> tuple[float, ...]:
 def series_ohm_stds(pad: config.Pad, node: config.Node) -> NDArray[np.float64]:
     """Return the standard deviations of the resistances from a pad's electrodes to ground, (c,) [ohm].
 
-    0 where electrodes touch.
+    0 where electrodes touch, and where there are none.
     """
-    if not np.min(pad.gaps_mm) > 0:
+    if pad.response or pad.press_map or not np.min(pad.gaps_mm) > 0:
         return np.zeros(len(pad.electrode_names))
     return np.hypot(node.series_std * np.array(pad.series_ohm), node.series_std_ohm)
+
+
+def shape_stds(
+    pad: config.Pad, sheet: config.Sheet, network: ChannelModel
+) -> tuple[NDArray[np.float64], float]:
+    """Return the standard deviations of the ends of a pad's electrodes (2 c,), in units of its rectangle, and
+    of its waves; of a map, whose changes are those by one standard deviation, ones."""
+    if isinstance(network, ChannelMap):
+        return np.ones(2 * network.channels), 1.0
+    assert isinstance(network, ElectrodeNetwork)
+    return sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network), sheet.unevenness_std
 
 
 def metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> NDArray[np.float64]:
@@ -192,7 +266,10 @@ def metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> NDArray[np.fl
 
 
 def relative_size_stds(pad: config.Pad, sheet: config.Sheet) -> tuple[float, float]:
-    """Return the relative standard deviations of a pad's length, and of its width in the middle."""
+    """Return the relative standard deviations of a pad's length, and of its width in the middle; 0 where
+    presses show them."""
+    if pad.press_map is not None:
+        return 0.0, 0.0
     surface = pad_surface(pad)
     width_m = float(surface.b * surface.scale(surface.a / 2, surface.b / 2))
     std_m = sheet.size_std_mm * _M_PER_MM
@@ -200,6 +277,9 @@ def relative_size_stds(pad: config.Pad, sheet: config.Sheet) -> tuple[float, flo
 
 
 def log_aspect_std(pad: config.Pad, sheet: config.Sheet) -> float:
-    """Return the standard deviation of the logarithm of the ratio of the rectangle's sides."""
+    """Return the standard deviation of the logarithm of the ratio of the rectangle's sides; 0 where presses
+    show it."""
+    if pad.press_map is not None:
+        return 0.0
     size_x, size_y = relative_size_stds(pad, sheet)
     return math.sqrt(size_x**2 + size_y**2 + (sheet.anisotropy_std / 2) ** 2)

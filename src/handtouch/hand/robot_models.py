@@ -39,9 +39,16 @@ _MAX_PAD_DEPTH_M, _MAX_PAD_HEIGHT_M = 0.003, 0.010
 """Distance of a pad's centre below its link's body, and above it, beyond which its mount is rejected."""
 _OUTWARD_TEST_STEP_M = 0.003
 _KEYS_REQUIRING_URDF = (
-    *("palm_link", "base_link", "joint_names", "joint_prefix"),
-    *("mount_std_mm", "mount_std_deg", "joint_std_deg", "joint_std_mm"),
-    *("joint_backlash_deg", "joint_backlash_mm"),
+    "palm_link",
+    "base_link",
+    "joint_names",
+    "joint_prefix",
+    "mount_std_mm",
+    "mount_std_deg",
+    "joint_std_deg",
+    "joint_std_mm",
+    "joint_backlash_deg",
+    "joint_backlash_mm",
 )
 _GRADIENT_STEP_M = 1e-5
 _MAX_SURFACE_STEPS = 50
@@ -67,16 +74,17 @@ class RobotModels:
     """Kinematics of the hands that have a URDF; all attributes are lists over these hands.
 
     `hands`: names; `kinematics`; `pad_rows`: numbers of its pads among those of the deployment, in the order
-    of the kinematics' links; `joint_names`: names of the kinematics' joints in joint states; `followers`: by
-    their names in joint states; `joints_stale_s`, `group_distance_m`; `gravity`: unit vector (3,) in the base
-    frame; `mounts`: uncertainty of its mounts; `joint_errors`. Raises UrdfError, KeyError or OSError for
-    errors that `check_urdfs` reports.
+    of the kinematics' links; `pad_centres_m`: (n, 3) in their links; `joint_names`: names of the kinematics'
+    joints in joint states; `followers`: by their names in joint states; `joints_stale_s`, `group_distance_m`;
+    `gravity`: unit vector (3,) in the base frame; `magnetic_pads`: (n,); `mounts`: uncertainty of its
+    mounts; `joint_errors`. Raises UrdfError, KeyError or OSError for errors that `check_urdfs` reports.
     """
 
     def __init__(self, deployment: Deployment) -> None:
         self.hands: list[str] = []
         self.kinematics: list[HandKinematics] = []
         self.pad_rows: list[NDArray[np.intp]] = []
+        self.pad_centres_m: list[FloatArray] = []
         self.joint_names: list[tuple[str, ...]] = []
         self.followers: list[dict[str, FollowerJoint]] = []
         self.joints_stale_s: list[float] = []
@@ -84,6 +92,7 @@ class RobotModels:
         self.mounts: list[MountUncertainty] = []
         self.joint_errors: list[JointErrors] = []
         self.gravity: list[NDArray[np.float64]] = []
+        self.magnetic_pads: list[NDArray[np.bool_]] = []
         first = 0
         for hand in deployment.hands:
             if hand.urdf:
@@ -93,6 +102,7 @@ class RobotModels:
                 self.hands.append(hand.name)
                 self.kinematics.append(made)
                 self.pad_rows.append(np.arange(first, first + len(hand.pads)))
+                self.pad_centres_m.append(np.array([mount_transform(pad)[1] for pad in hand.pads]))
                 self.joint_names.append(tuple(_message_joint_name(hand, joint) for joint in made.joints))
                 self.followers.append(
                     {
@@ -110,6 +120,7 @@ class RobotModels:
                 play = np.where(slides, hand.joint_backlash_mm * 1e-3, np.radians(hand.joint_backlash_deg))
                 self.joint_errors.append(JointErrors(std, play / np.sqrt(12)))
                 self.gravity.append(np.array(hand.gravity) / np.linalg.norm(hand.gravity))
+                self.magnetic_pads.append(np.array([pad.is_magnetic for pad in hand.pads]))
             first += len(hand.pads)
 
 

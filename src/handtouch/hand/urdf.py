@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.hand.pads import rotation_from_rpy
+from handtouch.hand.rotations import rotation_matrices
 
 FloatArray = NDArray[np.float64]
 MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
@@ -63,6 +64,21 @@ class UrdfJoint(NamedTuple):
     """radians or metres; infinite without limit"""
     mimic: tuple[str, float, float] | None
     """name of the mimicked joint, multiplier, offset"""
+
+    def pose(self, positions: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+        """Return rotation (3, 3) and translation (3,) of the child link in the parent's frame.
+
+        positions: of joints, by name; 0 of others.
+        """
+        rotation, translation = self.rotation, self.translation_m
+        if self.kind not in MOVABLE_JOINT_TYPES:
+            return rotation, translation
+        name, factor, offset = self.mimic or (self.name, 1.0, 0.0)
+        at = factor * positions.get(name, 0.0) + offset
+        if self.kind == "prismatic":
+            return rotation, translation + rotation @ self.axis * at
+        turn = np.append(math.sin(at / 2) * self.axis, math.cos(at / 2))
+        return rotation @ rotation_matrices(turn[None])[0], translation
 
 
 class RobotDescription:
@@ -116,11 +132,6 @@ class RobotDescription:
         or planar joint above the palm, since nobody reports how that moves."""
         free = [joint for joint in self.joint_chain(palm) if joint.kind in ("floating", "planar")]
         return free[-1].child if free else self.root
-
-    def joints_between(self, link: str, other: str) -> list[UrdfJoint]:
-        """Return the joints that move one of two links relative to the other."""
-        one, two = self.joint_chain(link), self.joint_chain(other)
-        return [joint for joint in one if joint not in two] + [joint for joint in two if joint not in one]
 
 
 def read_urdf(path: Path) -> RobotDescription:

@@ -20,9 +20,9 @@ from pathlib import Path
 
 from handtouch.host import logs
 
-MAX_CHILD_MESSAGE_BYTES = 1 << 18
+MAX_CHILD_MESSAGE_BYTES = 3 << 17
 """Longer messages of a child process are not read. A calibration of 16 electrodes with all that can be
-learned of them has 71,229 bytes."""
+learned of them has 71,229 bytes, of 32 four times as many."""
 _MAX_DAEMON_MESSAGE_BYTES = 1 << 20
 _NICENESS = 10
 _OOM_SCORE = 500

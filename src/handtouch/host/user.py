@@ -1,12 +1,14 @@
-"""Name of the user who runs a command.
+"""Name of the user who runs a command, and of the program.
 
-Public name: `user_name`.
+Public names: `user_name`, `program_name`.
 """
 
 from __future__ import annotations
 
 import getpass
 import os
+
+import handtouch
 
 
 def user_name() -> str:
@@ -15,3 +17,8 @@ def user_name() -> str:
         return getpass.getuser()
     except (KeyError, OSError):  # OSError from Python 3.13 on
         return f"user {os.getuid()}"
+
+
+def program_name() -> str:
+    """Return the user's name and the program's version, as calibrations name their writer."""
+    return f"{user_name()}, handtouch {handtouch.__version__}"

@@ -119,7 +119,12 @@ class TouchFeatures:
         position_m, position_known, position_valid = self._positions(read, rows, touched)
         force_n, force_known, force_valid = self._forces(read, rows, sampled, touched)
         columns = [
-            *(sampled, touched, position_known, position_valid, force_known, force_valid),
+            sampled,
+            touched,
+            position_known,
+            position_valid,
+            force_known,
+            force_valid,
             *(np.where(position_known, value, 0.0) for value in position_m),
             *(np.where(force_known, value, 0.0) for value in force_n),
             np.clip(age_s, 0.0, MAX_AGE_S),

@@ -17,6 +17,7 @@ import numpy as np
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
 from handtouch.node.iio import IIO_FOLDER, AdcReading, FloatArray, IioDevice, find_trigger
 from handtouch.node.scan import ScanLayout
+from handtouch.node.settings import Adc
 
 DEVICES_FOLDER = Path("/dev")
 _MAX_AGE_NS, _MAX_AGE_PERIODS = 5_000_000, 3  # age of a scan used for a sample, the longer of both
@@ -34,24 +35,18 @@ class BufferedReader:
 
     def __init__(
         self,
-        device: str,
+        adc: Adc,
         channels: Sequence[str],
         *,
-        trigger: str | None = None,
-        rate_hz: float | None = None,
-        buffer_scans: int = 256,
-        average_scans: int = 1,
-        timeout_ms: float = 5.0,
         iio: Path = IIO_FOLDER,
         devices: Path = DEVICES_FOLDER,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._name, self._channels, self._trigger, self._rate_hz = device, tuple(channels), trigger, rate_hz
-        self._buffer_scans, self._timeout_ms = buffer_scans, timeout_ms
+        self._adc, self._channels = adc, tuple(channels)
         self._iio, self._devices, self._clock = iio, devices, clock
-        self._max_age_ns = max(round(_MAX_AGE_PERIODS * 1e9 / rate_hz) if rate_hz else 0, _MAX_AGE_NS)
+        self._max_age_ns = max(round(_MAX_AGE_PERIODS * 1e9 / adc.rate_hz) if adc.rate_hz else 0, _MAX_AGE_NS)
         self._max_silence_ns = max(self._max_age_ns, _MAX_SILENCE_NS)
-        self._recent: deque[tuple[FloatArray, int]] = deque(maxlen=average_scans)
+        self._recent: deque[tuple[FloatArray, int]] = deque(maxlen=adc.average_scans)
         self._file = -1
         self._opened_ns = 0
         self._trigger_now: IioDevice | None = None
@@ -59,7 +54,7 @@ class BufferedReader:
 
     def open(self) -> None:
         """Set up scan elements, trigger, time stamps and buffer, and start it."""
-        self._device = device = IioDevice.find(self._name, self._iio)
+        self._device = device = IioDevice.find(self._adc.device, self._iio)
         elements = device.elements_folder
         device.write(f"{device.buffer_folder}/enable", 0)
         self.millivolts = device.millivolts(self._channels)
@@ -75,15 +70,15 @@ class BufferedReader:
         self.limits = np.array(
             [self._layout.elements[position].limits for position in self._positions], np.float64
         )
-        if self._rate_hz is not None:
-            device.write("sampling_frequency", f"{self._rate_hz:g}")
+        if self._adc.rate_hz is not None:
+            device.write("sampling_frequency", f"{self._adc.rate_hz:g}")
         if self._has_time and device.has(_CLOCK):
             device.write(_CLOCK, "monotonic")
-        if self._trigger is not None:
-            trigger = find_trigger(self._trigger, self._iio)
-            device.write("trigger/current_trigger", self._trigger)
+        if self._adc.trigger is not None:
+            trigger = find_trigger(self._adc.trigger, self._iio)
+            device.write("trigger/current_trigger", self._adc.trigger)
             self._trigger_now = trigger if trigger.has("trigger_now") else None
-        device.write(f"{device.buffer_folder}/length", self._buffer_scans)
+        device.write(f"{device.buffer_folder}/length", self._adc.buffer_scans)
         path = self._devices / device.folder.name
         try:
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -104,8 +99,8 @@ class BufferedReader:
             self._trigger_now.write("trigger_now", 1)
             ready = select.poll()
             ready.register(self._file, select.POLLIN)
-            if not ready.poll(self._timeout_ms):
-                raise AdcError(AdcFaultKind.NO_CONVERSION, f"{self._path} within {self._timeout_ms:g} ms")
+            if not ready.poll(self._adc.timeout_ms):
+                raise AdcError(AdcFaultKind.NO_CONVERSION, f"{self._path} within {self._adc.timeout_ms:g} ms")
         self.drain()
         now_ns = self._clock()
         newest_ns = self._recent[-1][1] if self._recent else self._opened_ns
@@ -128,7 +123,7 @@ class BufferedReader:
                 f"{self._path}: {len(data)} bytes are no multiple of a scan's {self._layout.size_bytes}",
             )
         count = len(data) // self._layout.size_bytes
-        if count >= self._buffer_scans:
+        if count >= self._adc.buffer_scans:
             raise AdcError(AdcFaultKind.OVERRUN, f"{self._path}: all {count} scans of the buffer were filled")
         newest = data[-self._layout.size_bytes * (self._recent.maxlen or 1) :]
         values = self._layout.decode(newest, self._positions).astype(np.float64)
@@ -149,6 +144,10 @@ class BufferedReader:
             except AdcError:
                 return  # it has vanished
 
+    def fileno(self) -> int | None:
+        """Return None: scans have time stamps."""
+        return None
+
     def describe(self) -> str:
         """Return nothing: timing says all."""
         return ""
@@ -159,7 +158,7 @@ class BufferedReader:
 
     def _read_queued(self) -> bytes:
         """Return the queued bytes, at most those of a full buffer."""
-        full = self._layout.size_bytes * self._buffer_scans
+        full = self._layout.size_bytes * self._adc.buffer_scans
         data = b""
         try:
             while len(data) < full and (part := os.read(self._file, full - len(data))):

@@ -57,9 +57,13 @@ class DbcSource(Source):
             return str(error)
         return ""
 
+    def limits_of(self, channel: str, folder: Path) -> tuple[float, float]:
+        """Return the lowest and highest value of a signal, in its unit; infinite for a float."""
+        return self.limits or _signal_limits(_find_signal(_load_database(folder / self.file), channel)[1])
+
     def make_reader(self, channels: Sequence[str], folder: Path, clock: Callable[[], int]) -> DbcReader:
         """Return a reader of these signals."""
-        return DbcReader(self, channels, folder / self.file, clock)
+        return DbcReader(self, channels, folder, clock)
 
 
 @lru_cache
@@ -98,8 +102,12 @@ def _find_signal(database: Database, channel: str) -> tuple[Message, Signal]:
     raise ValueError(f"{suggest_name(channel, known)}the file has {shown or 'no signal'}")
 
 
+_Key = tuple[int, bool]
+"""Of a message: its identifier, and whether that has 29 bits."""
+
+
 class DbcReader(SourceReader):
-    """Reads the signals of one pad: a sample is complete when each of their messages has come since the last.
+    """Reads the signals of one pad: a sample is complete when each of them has come since the last.
 
     Times are the kernel's receive stamps; malformed are frames of a known identifier without such signals.
     """
@@ -107,28 +115,25 @@ class DbcReader(SourceReader):
     unit: ClassVar[str] = "frames"
 
     def __init__(
-        self, source: DbcSource, channels: Sequence[str], path: Path, clock: Callable[[], int]
+        self, source: DbcSource, channels: Sequence[str], folder: Path, clock: Callable[[], int]
     ) -> None:
-        super().__init__(source, channels, clock)
-        self._source, self._path = source, path
+        super().__init__(source, channels, folder, clock)
+        self._source = source
+        self._max_span_ns = round(_MAX_SPAN_PERIODS * 1e9 / source.rate_hz)
         self._bus: can.BusABC | None = None
-        self._messages: dict[tuple[int, bool], Message] = {}
-        self._places: dict[tuple[int, bool], list[tuple[int, str]]] = {}
-        self._values = np.zeros(len(channels))
-        self._stamps_ns: dict[tuple[int, bool], int] = {}
-
-    def open(self) -> None:
-        """Open the bus with a filter for the pad's messages. Raises AdcError."""
-        database = _load_database(self._path)
-        self._messages.clear()
-        self._places.clear()
-        for row, channel in enumerate(self._channels):
+        self._messages: dict[_Key, Message] = {}
+        self._places: dict[_Key, list[tuple[int, str]]] = {}
+        database = _load_database(folder / source.file)
+        for row, channel in enumerate(channels):
             message, signal = _find_signal(database, channel)
             key = message.frame_id, message.is_extended_frame
             self._messages[key] = message
             self._places.setdefault(key, []).append((row, signal.name))
-            if self._source.limits is None:
-                self.limits[row] = _signal_limits(signal)
+        self._values = np.zeros(len(channels))
+        self._stamps_ns = np.zeros(len(channels), np.int64)  # of the frames of the next sample, 0 without
+
+    def open(self) -> None:
+        """Open the bus with a filter for the pad's messages. Raises AdcError."""
         source = self._source
         try:
             self._bus = open_bus(
@@ -142,10 +147,10 @@ class DbcReader(SourceReader):
                 for number, extended in self._messages
             ]
             self._bus.set_filters(filters)
-        self._stamps_ns.clear()
+        self._stamps_ns[:] = 0
         self._begin()
 
-    def drain(self) -> None:
+    def receive(self) -> None:
         """Read the frames that have arrived. Raises AdcError."""
         if self._bus is None:
             return
@@ -164,13 +169,9 @@ class DbcReader(SourceReader):
             self._bus.shutdown()
             self._bus = None
 
-    def describe(self) -> str:
-        """Return the samples so far, for the log."""
-        return f"{self.samples} samples, {self.malformed} malformed frames"
-
     def _missing(self) -> str:
-        missing = [message.name for key, message in self._messages.items() if key not in self._stamps_ns]
-        return f"{self._source.channel}: no frame {', '.join(missing)}"
+        missing = [channel for channel, ns in zip(self._channels, self._stamps_ns, strict=True) if not ns]
+        return f"{self._source.channel}: no frame with {', '.join(missing)}"
 
     def _take(self, frame: can.Message) -> None:
         key = frame.arbitration_id, frame.is_extended_id
@@ -183,18 +184,15 @@ class DbcReader(SourceReader):
         except Exception:  # noqa: BLE001 - cantools and bitstruct raise several kinds for short frames
             self.malformed += 1
             return
+        stamp_ns = arrival_ns(frame, self._clock())
         for row, value in found:  # a multiplexed signal comes in another frame of this message
-            self._values[row] = value
-        self._stamps_ns[key] = last_ns = arrival_ns(frame, self._clock())
-        oldest_ns = last_ns - round(_MAX_SPAN_PERIODS * 1e9 / self._source.rate_hz)
-        self._stamps_ns = {
-            key: stamp_ns for key, stamp_ns in self._stamps_ns.items() if stamp_ns >= oldest_ns
-        }
-        if len(self._stamps_ns) < len(self._messages):
+            self._values[row], self._stamps_ns[row] = value, stamp_ns
+        self._stamps_ns[self._stamps_ns < stamp_ns - self._max_span_ns] = 0
+        if not self._stamps_ns.all():
             return
-        first_ns = min(self._stamps_ns.values())
+        first_ns, last_ns = int(self._stamps_ns.min()), int(self._stamps_ns.max())
         self._keep(AdcReading(self._values.copy(), last_ns, last_ns - first_ns))
-        self._stamps_ns.clear()
+        self._stamps_ns[:] = 0
 
 
 def _signal_limits(signal: Signal) -> tuple[float, float]:

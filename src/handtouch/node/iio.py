@@ -63,6 +63,10 @@ class AdcReader(Protocol):
 
     def close(self) -> None: ...
 
+    def fileno(self) -> int | None:
+        """Return a file to be drained as soon as it is readable, so that times of reading are right; None
+        without, or while it is closed."""
+
     def describe(self) -> str:
         """Return what the log tells of it besides its timing; empty for nothing."""
 
@@ -205,6 +209,10 @@ class OneShotReader:
 
     def close(self) -> None:
         """Do nothing: no file is open."""
+
+    def fileno(self) -> int | None:
+        """Return None: it is read when asked."""
+        return None
 
     def describe(self) -> str:
         """Return nothing."""

@@ -5,6 +5,7 @@ Public names: `LinesSource`, `LinesReader`, `parse_line`.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import ipaddress
 import logging
@@ -12,7 +13,8 @@ import math
 import os
 import re
 import socket
-from collections.abc import Callable, Sequence
+import termios
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
 from urllib.parse import urlsplit
@@ -25,9 +27,13 @@ from handtouch.node.iio import AdcReading
 from handtouch.node.source import Source, SourceReader
 
 MAX_LINE_BYTES = 4096
-_MAX_READ_BYTES = 65_536  # at a time: more than comes between two readings
-_SEPARATORS = re.compile(r"[\s,;]+")
-_LABELLED = re.compile(r"([A-Za-z_]\w*)[:=](.+)")
+_MAX_READ_BYTES = 65_536  # at a time
+_MAX_QUEUED_BYTES = 4 << 20  # that are read before others are served: what a sender's queue may hold
+_SEPARATORS = re.compile(r"\s*[,;]\s*|\s+")
+_LABEL = re.compile(r"[\"']?([A-Za-z_]\w*)[\"']?\s*[:=]\s*")
+_BRACKETS = " \t\r[](){}"  # around a list, tuple or object that Python or JSON prints
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_COMMENTS = (b"#", b"//")
 _CHANNEL = re.compile(r"[1-9]\d{0,2}|[A-Za-z_]\w*")
 _log = logging.getLogger("handtouch.node")
 
@@ -43,6 +49,13 @@ class LinesSource(Source):
         examples=["/dev/ttyACM0"],
     )
     baud: int = Field(115_200, ge=50, le=10_000_000, description="bit rate of a serial port")
+    start_s: float = Field(
+        5.0,
+        ge=0,
+        le=60,
+        description="time after opening that the first line may take: many boards restart when their port is "
+        "opened, and a boot loader waits",
+    )
 
     @field_validator("url")
     @classmethod
@@ -64,9 +77,9 @@ class LinesSource(Source):
             return ""
         return 'must be the number of a value in the line, from "1", or its label where lines have "x0:12"'
 
-    def make_reader(self, channels: Sequence[str], folder: Path, clock: Callable[[], int]) -> LinesReader:  # noqa: ARG002
+    def make_reader(self, channels: Sequence[str], folder: Path, clock: Callable[[], int]) -> LinesReader:
         """Return a reader of these channels."""
-        return LinesReader(self, channels, clock)
+        return LinesReader(self, channels, folder, clock)
 
 
 def _host_and_port(url: str) -> tuple[str, int]:
@@ -77,68 +90,88 @@ def _host_and_port(url: str) -> tuple[str, int]:
     return parts.hostname, parts.port
 
 
-def parse_line(line: bytes, channels: Sequence[str]) -> list[float] | None:
-    """Return the values of channels in a line, None if it lacks one or has anything but finite numbers.
+def parse_line(line: bytes) -> Mapping[str, float] | None:
+    """Return the numbers of a line by their places, from "1", and by their labels; None for anything else.
 
-    Values are separated by commas, semicolons, spaces or tabs; each may have a label: `x0:12 xa:3`.
+    They are separated by commas, semicolons, spaces or tabs, and finite; each may have a label: `x0:12 xa:3`.
     """
     try:
-        tokens = _SEPARATORS.split(line.decode("ascii").strip())
-        values: dict[str, float] = {}
-        for number, token in enumerate(tokens, 1):
-            labelled = _LABELLED.fullmatch(token)
-            value = float(labelled[2] if labelled else token)
-            values[str(number)] = value
-            if labelled:
-                values[labelled[1]] = value
-        found = [values[channel] for channel in channels]
-    except (ValueError, KeyError):
+        text = _LABEL.sub(r"\1:", line.decode("ascii").strip(_BRACKETS))
+    except UnicodeDecodeError:
         return None
-    return found if all(map(math.isfinite, values.values())) else None
+    values: dict[str, float] = {}
+    for place, token in enumerate(_SEPARATORS.split(text.rstrip().removesuffix(",").removesuffix(";")), 1):
+        label, _, number = token.rpartition(":")
+        if not _NUMBER.fullmatch(number) or label in values or not (label + "_").isidentifier():
+            return None
+        values[str(place)] = float(number)
+        if label:
+            values[label] = values[str(place)]
+    return values if all(map(math.isfinite, values.values())) else None
 
 
 class _Stream(Protocol):
-    """What lines are read from; both methods may raise OSError."""
+    """What lines are read from; `read` and `close` may raise OSError.
+
+    `cuts_lines`: it may be opened within a line
+    """
+
+    cuts_lines: ClassVar[bool]
 
     def read(self) -> bytes:
-        """Return what has arrived, without waiting."""
+        """Return some of what has arrived, nothing without; never wait."""
+
+    def fileno(self) -> int: ...
 
     def close(self) -> None: ...
 
 
 class LinesReader(SourceReader):
-    """Reads the newest line; each line is one sample.
+    """Reads the newest line; each line is one sample, and its time is that of reading it.
 
-    A line's time is that of reading it, which is after the reading before.
+    Of a line that lacks a number, or was joined with the next, the others would be misplaced: a line with
+    another count of numbers than most is dropped.
     """
 
     unit: ClassVar[str] = "lines"
 
-    def __init__(self, source: LinesSource, channels: Sequence[str], clock: Callable[[], int]) -> None:
-        super().__init__(source, channels, clock)
+    def __init__(
+        self, source: LinesSource, channels: Sequence[str], folder: Path, clock: Callable[[], int]
+    ) -> None:
+        super().__init__(source, channels, folder, clock, round(source.start_s * 1e9))
         self._url, self._baud = source.url, source.baud
         self._stream: _Stream | None = None
         self._rest = b""
         self._skips_line = False
+        self._usual_count = self._last_count = 0
         self._drained_ns = 0
 
     def open(self) -> None:
         """Open the source. Raises AdcError."""
         self._stream = _open_stream(self._url, self._baud)
-        self._rest = b""
-        self._skips_line = self._url != "-"  # the first may be the rest of one
+        self._rest, self._skips_line = b"", self._stream.cuts_lines
+        self._usual_count = self._last_count = 0
         self._begin()
         self._drained_ns = self._clock()
 
-    def drain(self) -> None:
+    def fileno(self) -> int | None:
+        """Return the file of the source while it is open."""
+        return None if self._stream is None else self._stream.fileno()
+
+    def receive(self) -> None:
         """Read what has arrived, keeping the newest line. Raises AdcError."""
         if self._stream is None:
             return
         try:
-            data = self._stream.read()
+            data = _read_queued(self._stream)
         except OSError as error:
             raise _failure(self._url, error) from error
         before_ns, self._drained_ns = self._drained_ns, self._clock()
+        pause_ns = self._drained_ns - before_ns
+        if pause_ns > self._max_silence_ns:
+            self._excuse(pause_ns)
+            self._skip_late(data)
+            return
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE_BYTES:
             self._rest, self._skips_line = b"", True
@@ -146,8 +179,8 @@ class LinesReader(SourceReader):
         for line in lines:
             if self._skips_line:
                 self._skips_line = False
-            elif line.strip():
-                self._take(line, self._drained_ns - before_ns)
+            elif line.strip() and not line.lstrip().startswith(_COMMENTS):
+                self._take(line)
 
     def close(self) -> None:
         """Close the source."""
@@ -155,51 +188,76 @@ class LinesReader(SourceReader):
             self._stream.close()
             self._stream = None
 
-    def describe(self) -> str:
-        """Return the lines so far, for the log."""
-        return f"{self.samples} lines, {self.malformed} malformed"
-
     def _missing(self) -> str:
         return f"{self._url}: no line with {', '.join(self._channels)}"
 
-    def _take(self, line: bytes, span_ns: int) -> None:
-        values = parse_line(line, self._channels)
-        if values is None:
+    def _skip_late(self, data: bytes) -> None:
+        """Skip what arrived in a pause of this process: nobody knows when."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        self.skipped += len(lines)
+        self._rest, self._skips_line = b"", bool(self._rest) or self._skips_line
+
+    def _take(self, line: bytes) -> None:
+        values = parse_line(line)
+        has_all = values is not None and all(channel in values for channel in self._channels)
+        if values is None or not has_all or not self._is_usual(sum(map(str.isdigit, values))):
             self._count_malformed(line)
-        else:
-            self._keep(AdcReading(np.array(values), self._drained_ns, span_ns, is_timed=False))
+            return
+        numbers = np.array([values[channel] for channel in self._channels])
+        self._keep(AdcReading(numbers, self._drained_ns, is_timed=False))
+
+    def _is_usual(self, count: int) -> bool:
+        """Return True for the usual count of numbers: that of the first line, or of two in a row since."""
+        if not self._usual_count or count == self._last_count:
+            self._usual_count = count
+        self._last_count = count
+        return count == self._usual_count
 
     def _count_malformed(self, line: bytes) -> None:
         self.malformed += 1
         if math.log10(self.malformed).is_integer():
             _log.warning(
-                "%s: %d lines without numbers for channels %s, the last: %r",
+                "%s: %d lines dropped; each must have a number for channels %s, and as many as others: %r",
                 self._url, self.malformed, ", ".join(self._channels), line[:80],
             )  # fmt: skip
+
+
+def _read_queued(stream: _Stream) -> bytes:
+    """Return what has arrived: all of it, so that the last line is the newest. Raises OSError."""
+    data = bytearray()
+    while len(data) < _MAX_QUEUED_BYTES and (part := stream.read()):
+        data += part
+    return bytes(data)
 
 
 class _StandardInput:
     """Standard input, which isn't closed."""
 
+    cuts_lines: ClassVar[bool] = False
+
     def __init__(self) -> None:
-        self._file = 0
-        os.set_blocking(self._file, False)
+        os.set_blocking(self.fileno(), False)
 
     def read(self) -> bytes:
         try:
-            data = os.read(self._file, _MAX_READ_BYTES)
+            data = os.read(self.fileno(), _MAX_READ_BYTES)
         except BlockingIOError:
             return b""
         if not data:
             raise OSError(errno.EPIPE, "it has ended")
         return data
 
+    def fileno(self) -> int:
+        return 0
+
     def close(self) -> None:
-        os.set_blocking(self._file, True)
+        os.set_blocking(self.fileno(), True)
 
 
 class _Datagrams:
     """UDP: a datagram has one line or more."""
+
+    cuts_lines: ClassVar[bool] = False
 
     def __init__(self, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -214,13 +272,13 @@ class _Datagrams:
             raise error if isinstance(error, OSError) else OSError(errno.EINVAL, str(error)) from error
 
     def read(self) -> bytes:
-        datagrams: list[bytes] = []
-        while sum(map(len, datagrams)) < _MAX_READ_BYTES:
-            try:
-                datagrams.append(self._socket.recv(_MAX_READ_BYTES))
-            except BlockingIOError:
-                break
-        return b"".join(data.rstrip(b"\n") + b"\n" for data in datagrams)
+        try:
+            return self._socket.recv(_MAX_READ_BYTES).rstrip(b"\n") + b"\n"
+        except BlockingIOError:
+            return b""
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
 
     def close(self) -> None:
         self._socket.close()
@@ -229,6 +287,8 @@ class _Datagrams:
 class _SerialPort:
     """A serial port or a TCP connection, by pyserial."""
 
+    cuts_lines: ClassVar[bool] = True
+
     def __init__(self, url: str, baud: int) -> None:
         try:
             import serial
@@ -236,12 +296,28 @@ class _SerialPort:
             text = "needs pyserial: pip install pyserial, or handtouch with the extra `serial`"
             raise OSError(errno.ENOPKG, text) from error
         self._port = serial.serial_for_url(url, baudrate=baud, timeout=0)
+        if not url.startswith("socket:"):
+            self._set_up_terminal()
 
     def read(self) -> bytes:
         return bytes(self._port.read(_MAX_READ_BYTES))
 
+    def fileno(self) -> int:
+        return int(self._port.fileno())
+
     def close(self) -> None:
         self._port.close()
+
+    def _set_up_terminal(self) -> None:
+        """Keep a board that restarts when its port is opened from doing so again, and bytes from waiting in
+        the adapter, 16 ms in many; another program that reads the port is an error."""
+        self._port.exclusive = True
+        with contextlib.suppress(ValueError, NotImplementedError):  # a port without that setting
+            self._port.set_low_latency_mode(True)
+        with contextlib.suppress(termios.error):
+            attributes = termios.tcgetattr(self.fileno())
+            attributes[2] &= ~termios.HUPCL
+            termios.tcsetattr(self.fileno(), termios.TCSANOW, attributes)
 
 
 def _open_stream(url: str, baud: int) -> _Stream:
@@ -256,5 +332,11 @@ def _open_stream(url: str, baud: int) -> _Stream:
 
 
 def _failure(url: str, error: OSError) -> AdcError:
-    """Return a failure with its cause: pyserial's errors hold that of the system."""
-    return AdcError(AdcFaultKind.of_os_error(error), f"{url}: {error.strerror or error}", error.errno or 0)
+    """Return a failure with its cause, and a remedy: pyserial's errors hold that of the system."""
+    remedies = {
+        errno.EACCES: "; add yourself to the port's group (usermod -aG dialout NAME), and log in again",
+        errno.EBUSY: "; close the program that has it, such as a serial monitor",
+        errno.EAGAIN: "; close the program that has it, such as a serial monitor",
+    }
+    text = f"{url}: {error.strerror or error}{remedies.get(error.errno or 0, '')}"
+    return AdcError(AdcFaultKind.of_os_error(error), text, error.errno or 0)

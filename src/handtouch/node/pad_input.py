@@ -17,6 +17,7 @@ from handtouch.node.iio import FloatArray
 from handtouch.node.settings import NodePad, Trim
 
 MAX_COUNT = 32767
+_MIN_END_COUNTS = MAX_COUNT / 50  # of a negative end: one nearer to zero is the offset of a converter without
 _SATURATED_SAMPLES = 3  # in succession, before a channel is reported
 _SATURATED_HOLD_NS = 1_000_000_000  # since the last one, before it is reported as recovered
 
@@ -52,8 +53,13 @@ class PadInput:
 
     @property
     def counts_per_ma(self) -> float:
-        """Counts per milliampere."""
-        return MAX_COUNT / self.pad.full_scale_ma
+        """Counts per milliampere, or per unit of values that aren't currents."""
+        return MAX_COUNT / self.pad.full_scale_signal
+
+    @property
+    def step_ma(self) -> FloatArray:
+        """Current (c,) [mA] of one unit of the raw values of a source."""
+        return np.asarray(np.abs(self._ma_per_unit * self._gain))
 
     @property
     def device(self) -> Device | None:
@@ -68,13 +74,22 @@ class PadInput:
         measured = (raw + offset) * scale * self._ma_per_unit
         return np.asarray((measured - self._offset_ma) * self._gain)
 
-    def counts(self, currents_ma: FloatArray) -> NDArray[np.int64]:
-        """Return the counts (..., c) of currents, limited to 16 bits."""
-        counts = np.rint(currents_ma * self.counts_per_ma)
-        return np.clip(counts, -MAX_COUNT - 1, MAX_COUNT).astype(np.int64)
+    def counts(self, currents_ma: FloatArray, ends_ma: FloatArray) -> NDArray[np.int64]:
+        """Return the counts (c,) of currents, limited to 16 bits.
+
+        A channel at one of the ends (2, c) of its range gets that end of the counts': the daemon knows by it
+        that it is saturated. An end near no current is none: a converter without negative values is there
+        while nothing touches.
+        """
+        counts = np.clip(np.rint(currents_ma * self.counts_per_ma), -MAX_COUNT - 1, MAX_COUNT)
+        low_ma, high_ma = np.sort(ends_ma, axis=0)
+        counts[currents_ma >= high_ma] = MAX_COUNT
+        has_bottom = low_ma * self.counts_per_ma < -_MIN_END_COUNTS
+        counts[has_bottom & (currents_ma <= low_ma)] = -MAX_COUNT - 1
+        return counts.astype(np.int64)
 
     def record_sample(self, at_limit: NDArray[np.bool_], now_ns: int) -> None:
-        """Record a successful sample; `at_limit` (c,): the channels at an end of their ranges."""
+        """Record a successful sample; `at_limit` (c,): the channels at an end of their counts."""
         self.has_sample = True
         for kind in self.faults:
             if _is_of_adc(kind):
@@ -93,7 +108,9 @@ class PadInput:
     def record_failure(self, error: AdcError, channels: int | None = None) -> None:
         """Record a failed sample, or a failed switch; `channels`: mask of those concerned, default: all."""
         mask = (1 << len(self.pad.channels)) - 1 if channels is None else channels
-        data = bytes((error.kind, mask & 0xFF)) + error.number.to_bytes(2, "little") + bytes((mask >> 8,))
+        data = (
+            bytes((error.kind, mask & 0xFF)) + error.number.to_bytes(2, "little") + bytes((mask >> 8 & 0xFF,))
+        )
         if _is_of_adc(error.kind):
             self.record_no_sample()
         if self._faults.get(error.kind) == data:

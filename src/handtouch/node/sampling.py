@@ -5,6 +5,7 @@ Public names: `AdcInput`, `Sampling`, `SampleTiming`, `make_inputs`.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from handtouch.node.settings import Adc, NodeFile
 
 _WINDOW_SAMPLES = 2000
 _MIN_RETRY_NS, _MAX_RETRY_NS = 100_000_000, 1_000_000_000
+_MAX_DRAIN_PERIOD_S = 0.02  # between two readings of a queue: less than what a source takes for a pause
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class AdcInput:
         self.timing = SampleTiming()
         self._reader = reader
         self._is_open = False
+        self._ends_ma: list[FloatArray] = []  # of the pads' channels, each (2, c)
         self._retry_ns, self._due_ns = 0, 0
 
     def sample(self, counts: NDArray[np.int64], now_ns: int, sync_ns: int | None) -> None:
@@ -112,26 +115,40 @@ class AdcInput:
         self._retry_ns = 0
         if sync_ns is not None:
             self.timing.add(sync_ns, reading.sample_ns, reading.span_ns, reading.is_timed)
-        currents = self._currents_ma(reading)
-        for pad, row, current_ma in zip(self.pads, self.rows, currents, strict=True):
+        currents = self._currents_ma(reading.raw)
+        for pad, row, current_ma, ends_ma in zip(self.pads, self.rows, currents, self._ends_ma, strict=True):
             own = counts[row, : len(current_ma)]
-            own[:] = pad.counts(current_ma)
-            raw = reading.raw[pad.columns]
-            low, high = self._reader.limits[pad.columns].T
-            at_limit = (raw <= low) | (raw >= high) | (own >= MAX_COUNT) | (own < -MAX_COUNT)
-            pad.record_sample(at_limit, now_ns)
+            own[:] = pad.counts(current_ma, ends_ma)
+            pad.record_sample((own >= MAX_COUNT) | (own < -MAX_COUNT), now_ns)
 
     def read_currents_ma(self) -> list[FloatArray] | None:
         """Return the currents (c,) of each pad [mA], None without a recent conversion. Raises AdcError."""
         reading = self._read()
-        return None if reading is None else self._currents_ma(reading)
+        return None if reading is None else self._currents_ma(reading.raw)
+
+    def wait(self, period_s: float, sleep: Callable[[float], None]) -> None:
+        """Let time pass without missing what arrives. Raises AdcError."""
+        steps = max(math.ceil(period_s / _MAX_DRAIN_PERIOD_S), 1)
+        for step in range(steps):
+            if step and self._is_open:
+                self._reader.drain()
+            sleep(period_s / steps)
 
     def maintain(self, now_ns: int) -> None:
-        """Keep the buffer from filling; sample a pad that has none, which reopens a closed ADC when due."""
-        if not all(pad.has_sample for pad in self.pads):
+        """Keep the buffer from filling; reopen a closed ADC when due."""
+        if self._is_open:
+            self.drain(now_ns)
+        else:
             most = max(len(pad.columns) for pad in self.pads)
             self.sample(np.zeros((max(self.rows) + 1, most), np.int64), now_ns, None)
-            return
+
+    @property
+    def file(self) -> int | None:
+        """File that is to be drained as soon as it is readable, None without."""
+        return self._reader.fileno()
+
+    def drain(self, now_ns: int) -> None:
+        """Read what has arrived."""
         try:
             self._reader.drain()
         except AdcError as error:
@@ -150,12 +167,14 @@ class AdcInput:
         if not self._is_open:
             self._reader.open()
             self._is_open = True
+            self._ends_ma = self._currents_ma(self._reader.limits.T)
         return self._reader.read()
 
-    def _currents_ma(self, reading: AdcReading) -> list[FloatArray]:
+    def _currents_ma(self, raw: FloatArray) -> list[FloatArray]:
+        """Return the currents of each pad (..., c) for raw values of all channels (..., channels)."""
         scale, offset = self._reader.millivolts
         return [
-            pad.currents_ma(reading.raw[pad.columns], scale[pad.columns], offset[pad.columns])
+            pad.currents_ma(raw[..., pad.columns], scale[pad.columns], offset[pad.columns])
             for pad in self.pads
         ]
 
@@ -186,6 +205,17 @@ class Sampling:
         for adc in self.adcs:
             adc.sample(self._counts, now_ns, self.sync_ns)
         return self._counts
+
+    @property
+    def files(self) -> list[int]:
+        """Files that are to be drained as soon as they are readable."""
+        return [adc.file for adc in self.adcs if adc.file is not None]
+
+    def drain(self, now_ns: int) -> None:
+        """Read what has arrived of the ADCs with such a file."""
+        for adc in self.adcs:
+            if adc.file is not None:
+                adc.drain(now_ns)
 
     def maintain(self, now_ns: int) -> None:
         """Maintain the ADCs, and bring the nodes' state up to date; to be called every 20 ms or so."""
@@ -243,15 +273,4 @@ def _make_reader(
     """Return the reader of an ADC's channels; it opens no file."""
     if adc.mode == "one-shot":
         return OneShotReader(adc.device, channels, rate_hz=adc.rate_hz, iio=sysfs, clock=clock)
-    return BufferedReader(
-        adc.device,
-        channels,
-        trigger=adc.trigger,
-        rate_hz=adc.rate_hz,
-        buffer_scans=adc.buffer_scans,
-        average_scans=adc.average_scans,
-        timeout_ms=adc.timeout_ms,
-        iio=sysfs,
-        devices=devices,
-        clock=clock,
-    )
+    return BufferedReader(adc, channels, iio=sysfs, devices=devices, clock=clock)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import select
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -62,6 +63,7 @@ class NodeService:
         self._excited: dict[str, bool] = {}
         self._bus_failed = False
         self.missed_syncs = 0
+        self._bus_file = _file_of(bus)
         _limit_to_node_frames(bus)
 
     def start(self) -> None:
@@ -129,13 +131,24 @@ class NodeService:
         self.sampling.close()
 
     def _receive(self, timeout_s: float) -> Iterator[can.Message]:
-        """Yield the received frames, at most _MAX_FRAMES."""
+        """Yield the received frames, at most _MAX_FRAMES; wait for one, or for data of a source."""
+        frame = self._bus.recv(timeout_s if self._bus_file is None else 0.0)
+        if frame is None and self._bus_file is not None:
+            self._wait(self._bus_file, timeout_s)
+            frame = self._bus.recv(0.0)
         for _ in range(_MAX_FRAMES):
-            frame = self._bus.recv(timeout_s)
             if frame is None:
                 return
             yield frame
-            timeout_s = 0.0
+            frame = self._bus.recv(0.0)
+
+    def _wait(self, bus_file: int, timeout_s: float) -> None:
+        """Wait for a frame; what a source sends meanwhile is read when it comes, which is its time."""
+        waiting = select.poll()
+        for file in (bus_file, *self.sampling.files):
+            waiting.register(file, select.POLLIN)
+        if any(file != bus_file for file, _ in waiting.poll(1e3 * timeout_s)):
+            self.sampling.drain(self._clock())
 
     def _sample(self, now_ns: int) -> NDArray[np.int64]:
         return self.sampling(now_ns)
@@ -224,6 +237,14 @@ class _ReportingWatchdog(ServiceWatchdog):
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + _REPORT_PERIOD_NS
             _log.info("%s", self._report_status())
+
+
+def _file_of(bus: can.BusABC) -> int | None:
+    """Return the file that is readable when a frame has come, None for a bus without."""
+    try:
+        return bus.fileno()
+    except NotImplementedError:
+        return None
 
 
 def _is_sync(frame: can.Message) -> bool:

@@ -5,6 +5,7 @@ Public names: `load`, `json_schema`, `NodeFile`, `TouchNode` and its tables.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import Counter
@@ -13,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, Union
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from handtouch.config.base import Table
+from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS, Name, Positive, Table
 from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
-from handtouch.config.tables import Name, NodeId, Positive
+from handtouch.config.tables import NodeId
 from handtouch.config.toml_text import parse_toml, read_text
-from handtouch.device.inputs import MAX_CHANNELS, MIN_CHANNELS
 from handtouch.node.source import Source
 from handtouch.node.source_kinds import source_kinds
 
@@ -133,7 +134,7 @@ class NodePad(Table):
         None, description="name of its [source.NAME], instead of an ADC", examples=["board"]
     )
     channels: PadChannels = Field(
-        description="channels of 0x6401:01 and those after it, one for each electrode (3 to 16). Of an ADC: "
+        description="channels of 0x6401:01 and those after it, one for each electrode (3 to 32). Of an ADC: "
         "IIO channels, e.g. voltage0, or voltage0-voltage1 (differential); of lines: the value's number, "
         "or its label; of a DBC file: SIGNAL or MESSAGE.SIGNAL"
     )
@@ -150,6 +151,12 @@ class NodePad(Table):
         examples=[0.0204],
     )
     full_scale_ma: Positive = Field(10.0, description="current at count 32767, as in the deployment")
+    full_scale: float | None = Field(
+        None,
+        description="of another source whose values aren't currents: value at count 32767, negative where "
+        "they fall with the force; instead of ma_per_unit and full_scale_ma",
+        examples=[4095.0],
+    )
     trim: str | None = Field(
         None,
         min_length=1,
@@ -168,14 +175,31 @@ class NodePad(Table):
             raise ValueError("gain_ohm must not be 0: it is the feedback resistance of the amplifiers")
         if self.ma_per_unit == 0:
             raise ValueError("ma_per_unit must not be 0: it is the current per unit of the values")
+        if self.full_scale is not None:
+            others = {"adc", "gain_ohm", "ma_per_unit", "full_scale_ma"} & self.model_fields_set
+            if others or self.full_scale == 0:
+                raise ValueError(
+                    "full_scale must not be 0, and takes the place of gain_ohm, ma_per_unit and "
+                    "full_scale_ma, for a source"
+                )
         if (self.adc is None) == (self.source is None):
             raise ValueError("give either adc or source: the name of an [adc.NAME] or a [source.NAME]")
         if len(set(self.channels)) < len(self.channels):
             raise ValueError("channels must be different ones")
         return self
 
+    @property
+    def full_scale_signal(self) -> float:
+        """Signal at count 32767: a current [mA], or in the unit of a source whose values aren't currents."""
+        return self.full_scale_ma if self.full_scale is None else abs(self.full_scale)
+
     def ma_per_unit_of(self, channel: str) -> float:
-        """Return the milliamperes per unit of a channel's values: mV of an ADC, else the source's unit."""
+        """Return the milliamperes per unit of a channel's values: mV of an ADC, else the source's unit.
+
+        Of a source whose values aren't currents, 1 or -1: their own unit takes the place of milliamperes.
+        """
+        if self.full_scale is not None:
+            return math.copysign(1.0, self.full_scale)
         if self.source is not None:
             return self.ma_per_unit or 1.0
         return 1.0 if channel.startswith("current") else 1.0 / (self.gain_ohm or 1.0)
@@ -328,11 +352,29 @@ def _problems_of_input(settings: TouchNode, pad: NodePad, section: str, folder: 
             yield Problem(f"{section}: channels", f" = {channel}", problem)
     is_current = all(channel.startswith("current") for channel in pad.channels)
     needed, other = ("gain_ohm", "ma_per_unit") if source is None else ("ma_per_unit", "gain_ohm")
-    if getattr(pad, needed) is None and not (source is None and is_current):
+    has_unit = pad.full_scale is not None or (source is None and is_current)
+    if getattr(pad, needed) is None and not has_unit:
         yield Problem(f"{section}: {needed}", "", f"is missing; {NodePad.model_fields[needed].description}")
     if getattr(pad, other) is not None:
         given = f" = {getattr(pad, other):g}"
         yield Problem(f"{section}: {other}", given, f"write {needed} for a [{table}.{name}]")
+    if source is not None and not any(source.problem_of(channel, folder) for channel in pad.channels):
+        yield from _problems_of_range(source, pad, section, folder)
+
+
+def _problems_of_range(source: Source, pad: NodePad, section: str, folder: Path) -> Iterator[Problem]:
+    """Yield the channel that ends below the full scale: the daemon wouldn't know that it is saturated."""
+    tops = [max(np.multiply(source.limits_of(c, folder), pad.ma_per_unit_of(c))) for c in pad.channels]
+    top = min(tops)
+    if top < pad.full_scale_signal:
+        key, unit = ("full_scale_ma", " mA") if pad.full_scale is None else ("full_scale", "")
+        channel = pad.channels[tops.index(top)]
+        yield Problem(
+            f"{section}: {key}",
+            f" = {getattr(pad, key):g}",
+            f"channel {channel} ends at {top:.4g}{unit}: give that at most, here and in the deployment, "
+            "which takes a channel at full scale for saturated",
+        )
 
 
 def _state_path(path: Path, settings: TouchNode) -> Path:

@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from handtouch.config.base import Table
-from handtouch.config.tables import Positive
+from handtouch.config.base import Positive, Table
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
 
 if TYPE_CHECKING:
-    from handtouch.node.iio import AdcReader, AdcReading, FloatArray
+    from handtouch.node.iio import AdcReader, AdcReading
 
 _MIN_SILENCE_NS = 50_000_000
 """Shortest silence that is a failure, as that of a buffered ADC: what an ordinary host may delay a read by"""
+_MIN_AGE_NS = 5_000_000
+"""Age up to which a sample is used at any rate, as that of a buffered ADC"""
 _SILENT_PERIODS = 3
-"""As many missing samples make a pad stale"""
+"""As many missing samples make a pad stale; a sample older than that isn't used"""
 
 
 class Source(Table):
@@ -44,8 +45,8 @@ class Source(Table):
     )
     limits: Annotated[tuple[float, float], Field(strict=False)] | None = Field(
         None,
-        description="lowest and highest value of a channel, at which it is reported as saturated; default: "
-        "those of 16-bit counts",
+        description="lowest and highest value of a channel, at which it is saturated; default: that of a DBC "
+        "signal, else unknown",
         examples=[(0.0, 4095.0)],
     )
 
@@ -60,9 +61,14 @@ class Source(Table):
         """Time without a sample that is a failure."""
         return max(round(_SILENT_PERIODS * 1e9 / self.rate_hz), _MIN_SILENCE_NS)
 
-    def limit_rows(self, channels: Sequence[str]) -> FloatArray:
-        """Return the lowest and highest values (channels, 2); infinite where they are unknown."""
-        return np.tile(self.limits or (-np.inf, np.inf), (len(channels), 1))
+    @property
+    def max_age_ns(self) -> int:
+        """Age up to which a sample is used."""
+        return max(round(_SILENT_PERIODS * 1e9 / self.rate_hz), _MIN_AGE_NS)
+
+    def limits_of(self, channel: str, folder: Path) -> tuple[float, float]:  # noqa: ARG002
+        """Return the lowest and highest value of a channel without a problem; infinite where unknown."""
+        return self.limits or (-np.inf, np.inf)
 
     def problem_of(self, channel: str, folder: Path) -> str:
         """Return why a pad can't have this channel, and a remedy; empty if it can.
@@ -79,56 +85,86 @@ class Source(Table):
 class SourceReader(ABC):
     """Reads the newest sample of a source once, so that an old one is never taken for new.
 
-    A subclass opens and closes what it reads from, and `drain` gives `_keep` each sample that has arrived.
-    `samples`, `malformed`: since the start; `unit`: what may be malformed. Implements `AdcReader`.
+    A subclass opens and closes what it reads from, and `receive` gives `_keep` each sample that has arrived.
+    `start_ns`: time after opening that the first sample may take. `samples`, `malformed`, and `skipped`, as a
+    newer sample came before the next SYNC: since the start; `unit`: what may be malformed. Implements
+    `AdcReader`.
     """
 
     unit: ClassVar[str]
 
-    def __init__(self, source: Source, channels: Sequence[str], clock: Callable[[], int]) -> None:
-        self._channels, self._clock, self._max_silence_ns = tuple(channels), clock, source.max_silence_ns
-        self.limits = source.limit_rows(channels)
+    def __init__(
+        self,
+        source: Source,
+        channels: Sequence[str],
+        folder: Path,
+        clock: Callable[[], int],
+        start_ns: int = 0,
+    ) -> None:
+        self._channels, self._clock = tuple(channels), clock
+        self._max_silence_ns, self._max_age_ns = source.max_silence_ns, source.max_age_ns
+        self._start_ns = max(start_ns, self._max_silence_ns)
+        self.limits = np.array([source.limits_of(channel, folder) for channel in channels])
         self.millivolts = np.ones(len(channels)), np.zeros(len(channels))
-        self.samples = self.malformed = 0
+        self.samples = self.malformed = self.skipped = 0
         self._newest: AdcReading | None = None
-        self._kept_ns = 0
+        self._opened_ns = self._first_ns = self._kept_ns = self._pause_ns = self._samples_before = 0
 
     @abstractmethod
     def open(self) -> None:
         """Open the source. Raises AdcError."""
 
     @abstractmethod
-    def drain(self) -> None:
+    def receive(self) -> None:
         """Read what has arrived. Raises AdcError."""
 
     @abstractmethod
     def close(self) -> None:
         """Close the source."""
 
-    @abstractmethod
-    def describe(self) -> str:
-        """Return the samples so far, for the log."""
-
-    @abstractmethod
     def _missing(self) -> str:
         """Return what of a sample doesn't come."""
+        return "no sample"
+
+    def fileno(self) -> int | None:
+        """Return a file that is readable when a sample may have come, None without; while it is open."""
+        return None
 
     def read(self) -> AdcReading | None:
-        """Return the newest sample if there is a new one. Raises AdcError after a silence."""
+        """Return the newest sample if there is a new one. Raises AdcError, also after a silence."""
         self.drain()
-        if self._newest is not None:
-            newest, self._newest = self._newest, None
-            return newest
-        if self._clock() - self._kept_ns <= self._max_silence_ns:
-            return None
-        text = f"{self._missing()} for {self._max_silence_ns / 1e6:g} ms"
+        newest, self._newest = self._newest, None
+        is_new = newest is not None and self._clock() - newest.sample_ns <= self._max_age_ns
+        return newest if is_new else None
+
+    def drain(self) -> None:
+        """Read what has arrived. Raises AdcError, also after a silence."""
+        self.receive()
+        limit_ns = self._max_silence_ns if self._kept_ns else self._start_ns
+        if self._clock() - self._pause_ns - (self._kept_ns or self._opened_ns) <= limit_ns:
+            return
+        text = f"{self._missing()} for {limit_ns / 1e6:g} ms"
         text += f"; {self.malformed} {self.unit} were anything else" if self.malformed else ""
         raise AdcError(AdcFaultKind.NO_CONVERSION, text)
 
+    def describe(self) -> str:
+        """Return the samples so far, for the log."""
+        text = f"{self.samples} samples"
+        count, span_ns = self.samples - self._samples_before, self._kept_ns - self._first_ns
+        text += f" ({(count - 1) / span_ns * 1e9:.4g} a second)" if span_ns > 0 else ""
+        return f"{text}, {self.skipped} replaced by newer ones, {self.malformed} malformed {self.unit}"
+
     def _begin(self) -> None:
         """Forget what was kept before the source was opened."""
-        self._newest, self._kept_ns = None, self._clock()
+        self._newest, self._opened_ns, self._samples_before = None, self._clock(), self.samples
+        self._first_ns = self._kept_ns = self._pause_ns = 0
+
+    def _excuse(self, pause_ns: int) -> None:
+        """Don't count a pause of this process as a silence of the source."""
+        self._pause_ns += pause_ns
 
     def _keep(self, reading: AdcReading) -> None:
-        self._newest, self._kept_ns = reading, self._clock()
+        self.skipped += self._newest is not None
+        self._newest, self._kept_ns, self._pause_ns = reading, self._clock(), 0
+        self._first_ns = self._first_ns or self._kept_ns
         self.samples += 1

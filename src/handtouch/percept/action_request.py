@@ -23,11 +23,12 @@ _HERMITE_WEIGHTS = _HERMITE_WEIGHTS / _HERMITE_WEIGHTS.sum()
 class CandidateAction:
     """A small motion of the hand, and the measurement that each hypothesis predicts for it.
 
-    `kind`: squeeze, slide, roll, hold, lift or press; `parameters`: values by name with unit, as published.
+    `kind`: squeeze, slide, roll, hold, lift, press or touch; `parameters`: values by name with
+    unit, as published.
     """
 
     kind: str
-    parameters: Mapping[str, float | str]
+    parameters: Mapping[str, float | str | Sequence[float]]
     predicted_outcomes: Mapping[str, tuple[float, float]]
     """hypothesis -> mean and standard deviation of the one number that the action measures; the deviation
     includes measurement noise and what the hypothesis itself leaves open"""

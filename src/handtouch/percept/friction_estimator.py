@@ -87,7 +87,13 @@ class FrictionEstimator(PerceptEstimator):
             state, monitor.limit
         )
         return PerceptEstimate(
-            *("friction", hand, pad, contact, t_ns, "estimated", state.label),
+            "friction",
+            hand,
+            pad,
+            contact,
+            t_ns,
+            "estimated",
+            state.label,
             probabilities={"sticking": 1 - state.probability, "incipient": state.probability},
             values=values,
         )

@@ -17,8 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.slip import SlipDetector
-from handtouch.core.stages.slip import MOTION_CLASSES, SLIP_SLICES
+from handtouch.core.stages.slip import MOTION_CLASSES, SlipDetector
 from handtouch.percept.relative_motion import RelativeMotion, slip_probability
 from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
 from handtouch.percept.slip_evidence import SlipEvidence
@@ -80,7 +79,7 @@ class MotionReporter:
         with np.errstate(invalid="ignore"):
             slips = self._log_odds[pads] > 0
         known = len(MOTION_CLASSES) * (slips + 2 * np.isfinite(self._log_odds[pads]))
-        return np.asarray(self._slip.column("label")[pads].astype(np.intp) + known)
+        return np.asarray(self._slip.contacts().label[pads].astype(np.intp) + known)
 
     def _pads_to_report(self, pads: IntArray, now_ns: int) -> IntArray:
         """Return the pads whose class changed, and some of those whose report period has passed."""
@@ -100,19 +99,16 @@ class MotionReporter:
         return self._percept(pad, now_ns, probabilities, relative)
 
     def _class_probabilities(self, pad: int, relative: RelativeMotion | None) -> dict[str, float]:
-        state = self._slip.state[pad]
-        slipping, log_odds, force_n, rate_n_per_s = (
-            float(state[SLIP_SLICES[name]][0])
-            for name in ("slipping", "log_odds", "force_n", "force_rate_n_per_s")
-        )
-        slips = 1.0 if slipping else slip_probability(log_odds)
-        leaves = _lift_off_probability(force_n, rate_n_per_s)
+        state = self._slip.contacts()[pad]
+        slipping = bool(state.slipping)
+        slips = 1.0 if slipping else slip_probability(float(state.log_odds))
+        leaves = _lift_off_probability(float(state.force_n), float(state.force_rate_n_per_s))
         stays = 1 - leaves
         if math.isfinite(by_joints := float(self._log_odds[pad])):
             slips = slip_probability(by_joints)
             if relative is not None:
                 slips = max(slips, relative.sliding_at_rest_probability)
-            sure = bool(slipping) or slips > _MIN_SLIDING_PROBABILITY
+            sure = slipping or slips > _MIN_SLIDING_PROBABILITY
             rolls = stays * (1 - slips) if slipping else 0.0
             found = (
                 stays * (1 - slips) - rolls, stays * slips * (not sure), stays * slips * sure, rolls, leaves,
@@ -136,21 +132,21 @@ class MotionReporter:
         probabilities: dict[str, float],
         relative: RelativeMotion | None = None,
     ) -> PerceptEstimate:
-        part = {name: self._slip.state[pad, columns] for name, columns in SLIP_SLICES.items()}
-        count = int(part["samples"][0])
+        state = self._slip.contacts()[pad]
+        count = int(state.samples)
         label = max(probabilities, key=lambda name: probabilities[name])
         few = count < _MIN_SAMPLES and label == "sticking"
         values: dict[str, float | str | Sequence[float] | None] = {
-            "velocity_m_per_s": part["velocity_m_per_s"].tolist(),
-            "velocity_m_per_s_std": np.sqrt(part["velocity_variance"]).tolist(),
-            "force_rate_n_per_s": float(part["force_rate_n_per_s"][0]),
-            "tremor_std_m": np.exp(0.5 * part["log_tremor_variance"]).tolist(),
+            "velocity_m_per_s": state.velocity_m_per_s.tolist(),
+            "velocity_m_per_s_std": np.sqrt(state.velocity_variance).tolist(),
+            "force_rate_n_per_s": float(state.force_rate_n_per_s),
+            "tremor_std_m": np.exp(0.5 * state.log_tremor_variance).tolist(),
         }
-        if part["slipping"][0]:
-            values["slip_distance_m"] = float(np.hypot(*(part["position_m"] - part["slip_start_m"])))
+        if state.slipping:
+            values["slip_distance_m"] = float(np.hypot(*(state.position_m - state.slip_start_m)))
         if relative is not None:
             values |= relative.message_values()
-        log_ratio = float(part["log_ratio"][0])
+        log_ratio = float(state.log_ratio)
         return PerceptEstimate(
             "motion",
             int(self._poses.hand_index[pad]),
@@ -163,9 +159,9 @@ class MotionReporter:
             values,
             {
                 "samples": count,
-                "span_s": float(part["age_s"][0]),
+                "span_s": float(state.age_s),
                 "log_odds": log_ratio if math.isfinite(log_ratio) else 0.0,
-                "slips": int(part["slips"][0]),
+                "slips": int(state.slips),
             },
             f"contact has just begun: at least {_MIN_SAMPLES} samples are needed" if few else "",
         )

@@ -6,7 +6,6 @@ Public names: `KnownShape`, `build_shape`. Primitives are analytic; a mesh becom
 from __future__ import annotations
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from handtouch.config.objects import (
     ObjectTable,
     SphereShape,
 )
+from handtouch.config.surfaces import surface_triangles
 from handtouch.hand.body_distance import squared_distance_from_triangles
 
 FloatArray = NDArray[np.float64]
@@ -182,7 +182,7 @@ class _Grid(KnownShape):
 
 
 def build_shape(known: ObjectTable) -> KnownShape:
-    """Return the shape of a known object. Raises ValueError or OSError for a mesh that can't be used."""
+    """Return the shape of a known object. Raises ValueError for a mesh that can't be used."""
     shape = known.shape
     if isinstance(shape, SphereShape):
         return _Ball(_M_PER_MM * shape.diameter_mm / 2)
@@ -195,7 +195,7 @@ def build_shape(known: ObjectTable) -> KnownShape:
         shank = [shape.diameter_mm, 2 * shape.head_length_mm + shape.length_mm, shape.length_mm]
         return _Turned(_M_PER_MM / 2 * np.array([head, shank]))
     assert isinstance(shape, MeshShape)
-    return _grid_of_mesh(Path(shape.file), shape.unit_mm * _M_PER_MM)
+    return _grid_of_mesh(shape.file, shape.unit_mm * _M_PER_MM)
 
 
 def _length(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -226,11 +226,9 @@ def _box_symmetries(half_m: FloatArray) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def _grid_of_mesh(file: Path, unit_m: float) -> _Grid:
-    from handtouch.field.triangulation import parse_stl  # only here: few objects are meshes
-
-    surface = parse_stl(file.read_bytes())
-    corners = unit_m * surface.points[surface.triangles]
+def _grid_of_mesh(file: str, unit_m: float) -> _Grid:
+    surface = surface_triangles(file, unit_m)
+    corners = surface.points[surface.triangles]
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     middle, half = (low + high) / 2, (high - low) / 2
     corners = corners - middle

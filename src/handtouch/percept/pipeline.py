@@ -26,6 +26,7 @@ from handtouch.percept.samples import (
 )
 from handtouch.percept.shape import PairDistanceFunction, ShapeEstimator
 from handtouch.percept.slip_questions import slip_questions
+from handtouch.percept.stiffness_estimator import ExpectedRadius, StiffnessEstimator
 from handtouch.wire import PERCEPT_KINDS
 
 _FIT_PERIOD_NS = 10_000_000
@@ -58,11 +59,14 @@ class PerceptPipeline:
         pair_m: PairDistanceFunction | None = None,
         shear_pads: NDArray[np.bool_] | None = None,
         surface_m: FloatArray | None = None,
+        extent_m: FloatArray | None = None,
+        radii: Sequence[ExpectedRadius | None] | None = None,
     ) -> PerceptPipeline:
         """Return a pipeline of all estimators.
 
-        pair_m: see `ShapeEstimator`; shear_pads: (n,), pads above shear pads, by default none; surface_m: see
-        `ObjectEstimator`, by default no untouched pad is evidence.
+        pair_m: see `ShapeEstimator`; shear_pads: (n,), pads above shear pads, by default none; surface_m,
+        extent_m: see `ObjectEstimator`, by default no untouched pad is evidence; radii: see
+        `StiffnessEstimator`, by default all pads have one sheet.
         """
         above_shear = np.zeros(buffer.size, np.bool_) if shear_pads is None else shear_pads
         surface_m = np.zeros((buffer.size, 0, 3)) if surface_m is None else surface_m
@@ -71,7 +75,8 @@ class PerceptPipeline:
             (
                 ShapeEstimator(buffer.size, pair_m=pair_m),
                 FrictionEstimator(above_shear),
-                ObjectEstimator(surface_m),
+                ObjectEstimator(surface_m, extent_m),
+                StiffnessEstimator(radii or [None] * buffer.size),
             ),
         )
 

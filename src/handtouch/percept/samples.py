@@ -45,6 +45,8 @@ SAMPLE_FIELDS: dict[str, tuple[int, ...]] = {
     "tremor_std_m": (2,),  # as learnt
     "force_vector_n": (3,),  # in the link's frame, above a shear pad
     "force_vector_covariance_n2": (3, 3),
+    "contact_radius_m": (),  # by both sheets of a pad
+    "contact_radius_std_m": (),
 }
 """Fields of a sample and their shapes; SI units, NaN where unknown."""
 

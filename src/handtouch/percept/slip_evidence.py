@@ -23,15 +23,15 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import view_memory
-from handtouch.core.slip import SlipDetector
+from handtouch.core.memory import view_memory, view_rows
 from handtouch.core.stages.evidence import (
     EVIDENCE_FIELDS,
     EVIDENCE_WINDOWS_S,
-    EVIDENCE_WORK,
     SLIP_FEATURES,
     EvidenceStage,
 )
+from handtouch.core.stages.rows import SLIP_ROW
+from handtouch.core.stages.slip import SlipDetector
 from handtouch.percept.relative_motion import RelativeMotion
 from handtouch.percept.samples import FIELD_SLICES, ContactBuffer, IntArray
 
@@ -58,30 +58,25 @@ class SlipEvidence:
         self._features = np.full((n, len(SLIP_FEATURES)), np.nan)
         self._compared = view_memory(np.zeros(5))
         steps = [max(round(window_s / period_s), 1) for window_s in EVIDENCE_WINDOWS_S]
+        arrays = {
+            "values": buffer.values,
+            "sample_ns": buffer.sample_ns,
+            "sample_count": buffer.sample_count,
+            "tested": trees.features,
+            "thresholds": trees.thresholds,
+            "leaves": trees.values,
+            "features": self._features,
+            "log_odds": self.log_odds,
+            "evidence_ns": self._evidence_ns,
+        }
         self._stage = EvidenceStage(
-            view_memory(buffer.values),
-            view_memory(buffer.sample_ns),
-            view_memory(buffer.sample_count),
-            buffer.length,
-            buffer.values.shape[2],
-            view_memory(np.array([FIELD_SLICES[name].start for name in EVIDENCE_FIELDS])),
-            view_memory(np.array(steps)),
-            view_memory(np.array(EVIDENCE_WINDOWS_S)),
-            view_memory(buffer.hand_index),
-            view_memory(slip.state),
-            view_memory(trees.features),
-            view_memory(trees.thresholds),
-            view_memory(trees.values),
-            trees.features.shape[1],
-            view_memory(self._features),
-            view_memory(self.log_odds),
-            view_memory(self._evidence_ns),
-            view_memory(np.full((n, 3), np.nan)),
-            view_memory(np.full(n, np.nan)),
-            view_memory(np.zeros(n)),
-            view_memory(np.zeros((n, 3))),
-            view_memory(np.zeros(n, np.intp)),
-            view_memory(np.zeros(EVIDENCE_WORK)),
+            arrays={name: view_memory(array) for name, array in arrays.items()},
+            offsets={name: FIELD_SLICES[name].start for name in EVIDENCE_FIELDS},
+            steps=steps,
+            width=buffer.values.shape[2],
+            levels=trees.features.shape[1],
+            hands=view_memory(buffer.hand_index),
+            slip=view_rows(slip.state, SLIP_ROW),
         )
 
     def restart_contacts(self, pads: IntArray) -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from handtouch import wire
-from handtouch.config import Deployment
-from handtouch.core.pad_model import networks_of
+from handtouch.config import Deployment, Pad
+from handtouch.core.pad_model import contact_law, law_of, networks_of
 from handtouch.field.surface import Surface
 from handtouch.hand import PadGeometry, mount_transform, pad_surface
 from handtouch.percept.messages import PerceptStatus, make_percept_message, make_request_message
@@ -27,6 +27,7 @@ from handtouch.percept.samples import (
     PerceptEstimate,
 )
 from handtouch.percept.shape import pair_distance
+from handtouch.percept.stiffness_estimator import ExpectedRadius
 from handtouch.wire import PERCEPT_KINDS
 
 _COLUMNS = wire.COLUMNS[wire.PerceptInput]
@@ -54,11 +55,14 @@ class PerceptWorker:
         self.contacts = ContactBuffer(n, [self._hands.index(name) for name in names])
         """latest samples of every contact"""
         shear_pads = np.array([pad.shear is not None for pad in pads], np.bool_)
+        surfaces = [pad_surface(pad) for pad in pads]
         self._pipeline = PerceptPipeline.build(
             self.contacts,
             self.pair_distance_m,
             shear_pads,
-            self._surface_points([pad_surface(pad) for pad in pads]),
+            self._surface_points(surfaces),
+            np.array([surface.extent_m for surface in surfaces]),
+            [_expected_radius(deployment, pad) for pad in pads],
         )
         self._requested = np.zeros(n, dtype=np.uint8)
         self._xy = np.full((n, 2), np.nan)  # positions of the last samples
@@ -149,11 +153,16 @@ class PerceptWorker:
         )
         slips[_COLUMNS["row"].to_array(message.row)] = expit(odds)
         return HandSnapshot(
-            *(self._hands.index(message.hand), int(rows[0]), message.t_ns, ids),
+            self._hands.index(message.hand),
+            int(rows[0]),
+            message.t_ns,
+            ids,
             _COLUMNS["clear"].to_array(message.clear).astype(np.bool_),
             slips,
-            *(poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]),
-            *(base[:9].reshape(3, 3), base[9:]),
+            poses[:, :9].reshape(-1, 3, 3),
+            poses[:, 9:],
+            base[:9].reshape(3, 3),
+            base[9:],
             message.known_object,
         )
 
@@ -182,3 +191,13 @@ class PerceptWorker:
 
     def _link_name(self, pad: int) -> str:
         return self._links[pad] if pad >= 0 else ""
+
+
+def _expected_radius(deployment: Deployment, pad: Pad) -> ExpectedRadius | None:
+    """Return what the tables of a pad's two sheets say of radii; None for one sheet."""
+    if pad.second_sheet is None:
+        return None
+    sheets = deployment.sheet_of(pad), deployment.sheets[pad.second_sheet]
+    relative = math.hypot(*(sheet.alpha_std / sheet.alpha for sheet in sheets))
+    apart = abs(2 / sheets[0].alpha - 2 / sheets[1].alpha)
+    return ExpectedRadius(contact_law(sheets[0], law_of(sheets[0])), relative / apart)

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from handtouch import config
-from handtouch.canbus.bus.load import burst_s, bus_load
+from handtouch.canbus.bus.load import SAMPLE_DATA_BYTES, burst_s, bus_load, frame_bits
 from handtouch.canbus.nodes.spec import check_mapping, check_nodes
-from handtouch.config.channels import channel_states, full_scale_counts, max_count
+from handtouch.config.channels import channel_states, full_scale_counts, max_count, node_channels
 from handtouch.config.eds import EdsError
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.pad_model import contact_law, law_of
-from handtouch.hand import pad_network, pad_surface
+from handtouch.hand import pad_channels, pad_surface
 from handtouch.hand.robot_models import check_urdfs, unchecked_items
 from handtouch.host.units import GRAM_FORCE_N
 
@@ -68,20 +68,37 @@ def worst_bus_load(deployment: config.Deployment, bus: config.Bus) -> float:
     if not pads:
         return 0.0
     heartbeat_ms = len(pads) / sum(1 / deployment.nodes[pad.node].heartbeat_ms for pad in pads)
-    return bus_load(
-        bus.bitrate_bit_s, len(pads), deployment.daemon.sync_period_ms * 1e-3, heartbeat_ms * 1e-3
-    )
+    period_s = deployment.daemon.sync_period_ms * 1e-3
+    further_bits = _further_bits(deployment, bus)
+    return bus_load(bus.bitrate_bit_s, len(pads), period_s, heartbeat_ms * 1e-3, further_bits)
+
+
+def _further_bits(deployment: config.Deployment, bus: config.Bus) -> int:
+    """Return the bits on a bus of the second and later TPDOs of all its pads, in a cycle."""
+    total = 0
+    for _, pad in deployment.pads_on(bus.name):
+        if pad.switch_states:  # one state, and one TPDO, in each cycle
+            continue
+        size = sum(channel.bits for channel in node_channels(deployment.nodes[pad.node])) // 8
+        for first in range(SAMPLE_DATA_BYTES, size, SAMPLE_DATA_BYTES):
+            total += frame_bits(min(SAMPLE_DATA_BYTES, size - first))
+    return total
 
 
 def find_warnings(deployment: config.Deployment) -> Iterator[str]:
     """Yield what is valid but questionable."""
     for bus in deployment.buses:
         yield from _bus_warnings(deployment, bus)
-    for key, names in (("node", deployment.nodes), ("sheet", deployment.sheets)):
-        used = {getattr(pad, key) for _, pad in deployment.pads}
+    keys = (("node", deployment.nodes, ("node",)), ("sheet", deployment.sheets, ("sheet", "second_sheet")))
+    for key, names, of_pad in keys:
+        used = {getattr(pad, one) for _, pad in deployment.pads for one in of_pad}
         for name in names:
             if name not in used:
                 yield f"[{key}.{name}]: no pad uses it"
+    responses = [pad.response for _, pad in deployment.pads]
+    for name, response in deployment.responses.items():
+        if response not in responses:
+            yield f"[response.{name}]: no pad uses it"
     for name, node in deployment.nodes.items():
         if node.heartbeat_timeout_ms < 2 * node.heartbeat_ms:
             yield (
@@ -160,15 +177,18 @@ def _serial_warnings(hand: config.HandTable) -> Iterator[str]:
 
 def _pad_warnings(pad: config.Pad, deployment: config.Deployment) -> Iterator[str]:
     a, b = pad.surface.rectangle_mm
-    sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
-    touch = pad.touch or deployment.touch
-    if not pad.arcs_mm and max(a / b, b / a) > MAX_USUAL_ASPECT:  # electrodes on arcs are anywhere
+    sheet, node = deployment.sheet_of(pad), deployment.nodes[pad.node]
+    touch = deployment.touch_of(pad)
+    has_electrodes = pad.response is None
+    if (
+        has_electrodes and not pad.arcs_mm and max(a / b, b / a) > MAX_USUAL_ASPECT
+    ):  # electrodes on arcs are anywhere
         long, short = ("x", "y") if a > b else ("y", "x")
         yield (
             f"{max(a / b, b / a):.1f} times longer along {long} than along {short}: the far "
             "electrodes carry almost no current, so positions are inaccurate"
         )
-    if 2 * sheet.contact_radius_mm > min(a, b) / 2:
+    if has_electrodes and 2 * sheet.contact_radius_mm > min(a, b) / 2:
         yield (
             f"contact_radius_mm = {sheet.contact_radius_mm}: large for a pad of "
             f"{min(a, b):.1f} mm, so forces are wrong near its edges"
@@ -198,11 +218,13 @@ def _electronics_warnings(pad: config.Pad, node: config.Node, sheet: config.Shee
         f"check the units of full_scale_ma = {node.full_scale_ma} (mA), drive_v = {node.drive_v} (V), "
         f"ohm_per_square = {sheet.ohm_per_square} (ohm), contact_ohm_mm2 = {sheet.contact_ohm_mm2} (ohm mm2)"
     )
+    if node.full_scale is not None:
+        hint = f"check that full_scale = {node.full_scale} ({node.unit}) and signal_per_n have the same unit"
     if counts < MIN_USUAL_COUNTS:
         yield f"1 N in the pad's middle reads fewer than {MIN_USUAL_COUNTS} counts; {hint}"
     elif counts > full_scale_counts(node):
         yield f"1 N in the pad's middle exceeds the full scale of the channels; {hint}"
-    if sheet.ohm_per_square < MIN_USUAL_SHEET_OHM:
+    if node.full_scale is None and sheet.ohm_per_square < MIN_USUAL_SHEET_OHM:
         yield (
             f"ohm_per_square = {sheet.ohm_per_square}: below {MIN_USUAL_SHEET_OHM} ohm the leads share the "
             "currents with the sheet; check the unit"
@@ -218,14 +240,18 @@ def _force_of_current(sheet: config.Sheet, node: config.Node, current_ma: float)
 
 
 def _burst_ms(deployment: config.Deployment, bus: config.Bus) -> float:
-    return burst_s(bus.bitrate_bit_s, len(deployment.pads_on(bus.name))) * 1e3
+    pads = len(deployment.pads_on(bus.name))
+    return burst_s(bus.bitrate_bit_s, pads, _further_bits(deployment, bus)) * 1e3
 
 
 def _pad_summary(pad: config.Pad, deployment: config.Deployment) -> dict[str, Any]:
     a, b = pad.surface.rectangle_mm
     length_m, width_m = pad.surface.build().extent_m
-    sheet, node = deployment.sheets[pad.sheet], deployment.nodes[pad.node]
+    sheet, node = deployment.sheet_of(pad), deployment.nodes[pad.node]
     force_n, force_at, needed_ma = _range(pad, node, sheet)
+    needed = {"needed_full_scale_ma": round(needed_ma, 2)}
+    if node.full_scale is not None:  # no current
+        needed = {"needed_full_scale": round(1e-3 * needed_ma, 4)}
     return {
         "link": pad.link,
         "bus": pad.bus,
@@ -237,7 +263,7 @@ def _pad_summary(pad: config.Pad, deployment: config.Deployment) -> dict[str, An
         "aspect": round(max(a / b, b / a), 3),
         "measured_force_n": None if math.isinf(force_n) else round(force_n, 2),
         "measured_force_electrode": force_at,
-        "needed_full_scale_ma": round(needed_ma, 2),
+        **needed,
     }
 
 
@@ -253,6 +279,9 @@ def _range(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> tuple[flo
 
 def _currents(pad: config.Pad, node: config.Node, sheet: config.Sheet) -> ChannelCurrents:
     return ChannelCurrents(
-        *(pad_network(pad, sheet), pad_surface(pad), contact_law(sheet, law_of(sheet))),
-        *(node.drive_v, sheet.ohm_per_square),
+        pad_channels(pad, sheet, node),
+        pad_surface(pad),
+        contact_law(sheet, law_of(sheet)),
+        node.drive_v,
+        sheet.ohm_per_square,
     )

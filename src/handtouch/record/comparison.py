@@ -79,8 +79,16 @@ class ContactComparison:
 
 
 _COMPARED_KEYS = (
-    *("session", "id", "hand", "link", "event", "t_ns", "begin_ns"),
-    *("position_m", "force_n", "force_status"),
+    "session",
+    "id",
+    "hand",
+    "link",
+    "event",
+    "t_ns",
+    "begin_ns",
+    "position_m",
+    "force_n",
+    "force_status",
 )
 
 

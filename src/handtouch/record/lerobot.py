@@ -107,15 +107,18 @@ def export_lerobot(
 
 
 def _survey(recording: Recording, hand: str, fps: float) -> tuple[int, str, tuple[str, ...]]:
-    """Return the most samples between two dataset frames, the hand, and its joints. Raises ValueError."""
+    """Return the most samples between two dataset frames, the hand, and its joints whose position was ever
+    known. Raises ValueError."""
     hands: set[str] = set()
-    joints: dict[str, tuple[str, ...]] = {}
+    joints: dict[str, dict[str, bool]] = {}
     longest, before, within = 0, 0, 0
     for entry in recording.read("hand", "joints"):
         payload = entry.payload
         name = str(payload.get("hand"))
         if entry.topic.startswith("joints/"):
-            joints.setdefault(name, tuple(payload["names"]))
+            known = joints.setdefault(name, {})
+            for joint, position_rad in zip(payload["names"], payload["position_rad"], strict=True):
+                known[joint] = known.get(joint, False) or position_rad is not None
             continue
         hands.add(name)
         if hand and name != hand:
@@ -136,7 +139,8 @@ def _survey(recording: Recording, hand: str, fps: float) -> tuple[int, str, tupl
     if longest > _MAX_SAMPLES:
         raise ValueError(f"{longest} samples between two frames of {fps:g} Hz; give a higher --fps")
     (hand,) = {hand} if hand else hands
-    return longest + 1, hand, joints.get(hand, ())  # one more, as frames don't begin with slots
+    known_joints = tuple(joint for joint, known in joints.get(hand, {}).items() if known)
+    return longest + 1, hand, known_joints  # one more, as frames don't begin with slots
 
 
 def _episodes(recording: Recording, hand: str, joints: Sequence[str], max_gap_s: float) -> Iterator[_Episode]:

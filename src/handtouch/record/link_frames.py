@@ -101,14 +101,7 @@ class LinkFrames:
                     yield self.frame_name(hand, link), list(shapes)
 
     def _joint_frame(self, hand: str, joint: urdf.UrdfJoint) -> LinkTransform:
-        rotation, translation = joint.rotation, joint.translation_m
-        if joint.kind in urdf.MOVABLE_JOINT_TYPES:
-            name, factor, offset = joint.mimic or (joint.name, 1.0, 0.0)
-            at = factor * self._joints.get(hand, {}).get(name, 0.0) + offset
-            if joint.kind == "prismatic":
-                translation = translation + rotation @ joint.axis * at
-            else:
-                rotation = rotation @ Rotation.from_rotvec(at * joint.axis).as_matrix()
+        rotation, translation = joint.pose(self._joints.get(hand, {}))
         parent, child = self.frame_name(hand, joint.parent), self.frame_name(hand, joint.child)
         return LinkTransform(parent, child, tuple(translation.tolist()), quaternion(rotation))
 

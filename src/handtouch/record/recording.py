@@ -35,8 +35,15 @@ _MAX_ITEMS = 1 << 17
 """Items of one list or map: a column of a hand has far fewer"""
 _MESSAGE_HEAD_BYTES = 22
 _DAMAGE = (
-    *(McapError, zstandard.ZstdError, struct.error, ValueError, TypeError, OverflowError),
-    *(RuntimeError, EOFError, MemoryError),
+    McapError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    TypeError,
+    OverflowError,
+    RuntimeError,
+    EOFError,
+    MemoryError,
 )
 
 

@@ -92,7 +92,7 @@ class _LogReplayer:
             self._known_ids |= {base + pad.node_id for base in _NODE_COB_BASES}
         self.pipeline.node_state[:] = PadState.CLEAR
         # by the timer in a pause of the log: enough for every contact to end
-        self._max_pause_ticks = int(self.pipeline.model.max_gap_periods.max()) + 2
+        self._max_pause_ticks = int(self.pipeline.model.touch.max_gap_periods.max()) + 2
 
     def process_frame(self, message: can.Message, t_ns: int) -> None:
         """Process a frame of the log."""

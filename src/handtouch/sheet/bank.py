@@ -56,7 +56,7 @@ _EXCEPTION = 0.02
 """Probability that one pad's sheet adapts and others of its material don't, or the reverse."""
 _REJECTED = 0.9
 """Probability that a sheet doesn't adapt, above which adaptation is rejected."""
-_KEPT, _MIN_LOG_WEIGHT = 0.995, -30.0
+_KEPT, _MIN_LOG_WEIGHT, _MIN_LIKELIHOOD = 0.995, -30.0, 1e-300
 """Evidence that is left of former windows at each new one; least log likelihood of a model."""
 _EXPONENT_WALK, _MAX_EXPONENT = 0.001, 0.25
 _MIN_SLOPE = 0.02
@@ -296,6 +296,7 @@ class ModelBank:
         still = _STEADY_PROBABILITY * self._saturated * _density(saturated, variance)
         unsteady = _density(change, _UNSTEADY_STD**2 + scatter + scatter_before)
         likelihood = steady + still + (1 - _STEADY_PROBABILITY) * unsteady[:, None]
+        likelihood = np.maximum(likelihood, _MIN_LIKELIHOOD)  # what no model explains is evidence for none
         gain = uncertain / variance
         move = gain * (steady * adapting + still * saturated) / likelihood
         move = np.clip(state.exponent[rows] + move, 0.0, _MAX_EXPONENT) - state.exponent[rows]

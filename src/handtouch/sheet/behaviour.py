@@ -157,13 +157,6 @@ class SheetHistory:
         rest = self._model.discretise(max(t_s - count * self._step_s, 0.0))
         return self._forward(rest, self._state.copy(), t_s)
 
-    def load_ratio(self, t_s: float) -> FloatArray:
-        """Return apparent over true load (n,), 0 without load; its power alpha multiplies the layer's
-        conductance."""
-        load = np.asarray(self._loads(t_s), np.float64)
-        apparent = self.apparent_n(t_s)
-        return np.divide(apparent, load, out=np.zeros_like(apparent), where=load > 0)
-
     def _forward(self, step: SheetStep, state: SheetModelState, t_s: float) -> FloatArray:
         return step.forward(state, self._loads(t_s), self._powered(t_s), self._warmer_k(t_s))
 

@@ -29,7 +29,7 @@ class ParameterUncertainty:
     creep, adaptation, hysteresis: as fractions of the correction made by each. late_creep: of the load, that
     a reading reaches later than the creep's times. forget_time_s: time constant
     with which an undetected press becomes likely; infinite if the back force is known. temperature_k: of the
-    given temperature [K].
+    temperature, about that at which the contact law holds [K].
     """
 
     creep: float = 0.2
@@ -78,8 +78,17 @@ class CompensatorState:
         plays = model.hysteresis.inverse.initial_state(pads)
         back_n, flow_total_s, back_std_n, press_n, flow_s, impulse_ns = np.zeros((6, pads))
         return cls(
-            *(model.creep.initial_state(pads), plays, back_n, flow_total_s, back_std_n, press_n),
-            *(flow_s, impulse_ns, np.ones(pads, np.bool_), np.zeros(1), np.zeros(1, np.bool_)),
+            model.creep.initial_state(pads),
+            plays,
+            back_n,
+            flow_total_s,
+            back_std_n,
+            press_n,
+            flow_s,
+            impulse_ns,
+            np.ones(pads, np.bool_),
+            np.zeros(1),
+            np.zeros(1, np.bool_),
         )
 
 
@@ -110,7 +119,7 @@ class SheetCompensator:
         self.back_std_n = state.back_std_n
         """Standard deviation of the back force (n,) [N], without the present press's contribution."""
         self._press_n, self._flow_s, self._impulse = state.press_n, state.flow_s, state.impulse_ns
-        self._temperature_rise_k, self._update_period_s = 0.0, update_period_s
+        self._update_period_s = update_period_s
         self._ones = np.ones(pads)
         self._threshold_n = np.array(np.broadcast_to(model.adaptation.threshold_n, pads), np.float64)
         noise, swelling, warmth_k = model.fluctuation, model.temperature, self.uncertainty.temperature_k
@@ -160,10 +169,6 @@ class SheetCompensator:
         self.update_back_force()
         self._powered[:] = powered
 
-    def set_temperature_rise(self, warmer_k: float) -> None:
-        """Set the temperature above that at which the contact law holds [K]."""
-        self._temperature_rise_k = warmer_k
-
     def compensate(self, apparent_n: FloatArray, dt_s: float) -> FloatArray:
         """Return the load (n,) [N] at the end of an interval of `dt_s` >= 0 [s]; 0 without response.
 
@@ -197,9 +202,6 @@ class SheetCompensator:
 
     def _compensate(self, apparent_n: FloatArray) -> FloatArray:
         reading = np.maximum(apparent_n, 0.0)
-        swelling = self.model.temperature
-        if self._temperature_rise_k:
-            reading /= 1 + swelling.gain_per_k * self._temperature_rise_k
         creep = self.model.creep.discretise(math.inf) if self._state.load_is_old[0] else self._creep_step
         effective = creep.inverse(self._elements, reading)
         self._state.load_is_old[0] = False
@@ -210,8 +212,6 @@ class SheetCompensator:
             else self._invert_adaptation(effective, flows)
         )
         load = self._inverse_hysteresis.apply_to(self._plays, before) if len(self._plays) else before
-        if self._temperature_rise_k:
-            load = np.maximum(load - swelling.preload_n_per_k * self._temperature_rise_k, 0.0) * flows
         self.last_step[:] = load, before, effective, reading
         return load
 

@@ -1,7 +1,7 @@
 """What presses on the sheets of a simulated hand without a touch: its skin's weight, while its base turns.
 
 Public names: `Skin` (`[skin]`) and `BaseTurn` (`[[turn]]`) of a scenario, `base_rotation`, `gravity_in_base`,
-`axis_rotations`. `simulate.skin` computes the currents.
+`base_pose`, `axis_rotations`. `simulate.skin` computes the currents.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
+from scipy.spatial.transform import Rotation
 
-from handtouch.config.base import Table
-from handtouch.config.tables import Positive, Vector3
+from handtouch.config.base import Positive, Table, Vector3
 
 FloatArray = NDArray[np.float64]
 
@@ -39,7 +39,8 @@ class BaseTurn(Table):
         0.5, description="time in which the speed is reached, and lost at the end; at most half of the turn"
     )
     gravity_sent: bool = Field(
-        True, description="joint states carry the direction of gravity in the base's frame"
+        True,
+        description="joint states carry gravity in the base's frame, and its orientation",
     )
 
     @field_validator("axis")
@@ -77,6 +78,18 @@ def gravity_in_base(
         return None
     x, y, z = (base_rotation(turns, np.array([t_s]))[0].T @ gravity).tolist()
     return x, y, z
+
+
+def base_pose(
+    turns: Sequence[BaseTurn], gravity: Sequence[float], t_s: float
+) -> dict[str, tuple[float, ...]]:
+    """Return what joint states carry of the base's pose at a time: `gravity_in_base`, and the quaternion x,
+    y, z, w of its frame in that at the start."""
+    down = gravity_in_base(turns, gravity, t_s)
+    if down is None:
+        return {}
+    quaternion = Rotation.from_matrix(base_rotation(turns, np.array([t_s]))[0]).as_quat()
+    return {"gravity": down, "orientation": tuple(quaternion.tolist())}
 
 
 def axis_rotations(axis: FloatArray, angles: FloatArray) -> FloatArray:

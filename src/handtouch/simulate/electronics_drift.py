@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,14 @@ from handtouch.simulate import noise
 from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
+WARM_UP_S: Final = 120.0
 
 
 class ElectronicsDrift:
-    """Drift of the electronics: zeros of each channel, and temperature and supply of the whole hand.
+    """Zeros of each channel, and temperature and supply of the whole hand.
 
-    Rows are pads. All methods are functions of times (n,) since the start.
+    Rows are pads. All methods are functions of times (n,) since the start. `is_constant`: nothing drifts, and
+    zeros are 0.
     """
 
     def __init__(
@@ -38,7 +41,10 @@ class ElectronicsDrift:
             world.hand_rate(getattr(electronics, rate), rate)
             for rate in ("zero_drift_counts_per_s", "temperature_drift_k_per_s", "supply_drift_per_s")
         )
-        self.is_constant = not (self._zero_counts_per_s or self._temperature_k_per_s or self._supply_per_s)
+        self._warm_up_k = world.hand_rate(electronics.warm_up_k, "warm_up_k")
+        self._first_zeros = np.array([world.zero_counts(pad, count) for pad in pads])
+        rates = self._zero_counts_per_s, self._temperature_k_per_s, self._supply_per_s
+        self.is_constant = not (any(rates) or self._warm_up_k or self._first_zeros.any())
         self._zero_keys = np.array(
             [
                 noise.stream_key(world.seed, "zero", *name, channel)
@@ -55,7 +61,8 @@ class ElectronicsDrift:
 
     def temperature_rise_k(self, times_s: FloatArray) -> FloatArray:
         """Return the hand's temperature (n,) relative to that at the start."""
-        return np.asarray(self._bounded_walk(self._temperature_k_per_s, self._temperature_key, times_s)[0])
+        walk = self._bounded_walk(self._temperature_k_per_s, self._temperature_key, times_s)[0]
+        return np.asarray(walk + self._warm_up_k * np.minimum(times_s / WARM_UP_S, 1.0))
 
     def supply_ratio(self, times_s: FloatArray) -> FloatArray:
         """Return the supply voltage (n,) relative to the nominal one."""
@@ -68,7 +75,7 @@ class ElectronicsDrift:
     def zero_counts(self, times_s: FloatArray) -> FloatArray:
         """Return the counts (n, rows, c) of channels without current."""
         walk = self._bounded_walk(self._zero_counts_per_s, self._zero_keys, times_s)
-        zeros = walk.T.reshape(len(times_s), *self._gain_per_k.shape)
+        zeros = self._first_zeros + walk.T.reshape(len(times_s), *self._gain_per_k.shape)
         return np.asarray(zeros + self._offset_counts_per_k * self.temperature_rise_k(times_s)[:, None, None])
 
     @staticmethod

@@ -2,7 +2,8 @@
 
 A fault class declares its `kind`, the keys of its `[[fault]]` table, its effects, and how to draw one at
 random; everything else follows from the class. Public names: `Fault` and its subclasses, `FAULTS` (by kind),
-`INFLUENCES` (not faults, but with similar effects), `AnyFault` (any of them, as a scenario file has it).
+`INFLUENCES` (not faults, but with similar effects), `AnyFault` (any of them, as a scenario file has it),
+`electrode_index`.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from handtouch.config.base import Table
-from handtouch.config.tables import SIDE_ELECTRODES, Electrode, Name, NonNegative, Positive
+from handtouch.config.base import Name, NonNegative, Positive, Table
+from handtouch.config.tables import SIDE_ELECTRODES, Electrode
 from handtouch.simulate import draws
 from handtouch.simulate.sheet_circuit import Wiring
 from handtouch.simulate.smoothstep import smoothstep_array
@@ -26,6 +27,7 @@ from handtouch.wire.faults import FaultKind
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
+Channel = Annotated[str, Field(pattern=r"^(x0|xa|y0|yb|t[1-9][0-9]?)$")]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]
 Size = tuple[float, float]
 
@@ -198,7 +200,7 @@ class DeadElectrode(Fault):
     """Broken wire: the electrode floats, and the other three carry all of the current."""
 
     kind: Literal[FaultKind.DEAD_ELECTRODE] = FaultKind.DEAD_ELECTRODE
-    electrode: Electrode = Field(description="electrode whose wire is broken")
+    electrode: Channel = Field(description="electrode whose wire is broken")
     open_ohm: Positive = Field(1e9, description="resistance of the break")
 
     @classmethod
@@ -208,7 +210,7 @@ class DeadElectrode(Fault):
 
     def modify_wiring(self, wiring: Wiring) -> None:
         """Add the break to the electrode's resistor."""
-        wiring.series_ohm[_electrode_index(self.electrode)] += self.open_ohm
+        wiring.series_ohm[electrode_index(self.electrode)] += self.open_ohm
 
 
 class ShortedElectrode(Fault):
@@ -238,11 +240,11 @@ class ShortedElectrode(Fault):
 
     def modify_wiring(self, wiring: Wiring) -> None:
         """Add the short circuit."""
-        one = _electrode_index(self.electrode)
+        one = electrode_index(self.electrode)
         if self.to == "layer":
             wiring.layer_shorts.append((one, self.short_ohm))
             return
-        other = _electrode_index(self.to)
+        other = electrode_index(self.to)
         wiring.electrode_shorts.append((one, other, self.short_ohm))
         wiring.series_ohm[[one, other]] += self.input_ohm
 
@@ -272,14 +274,14 @@ class SwappedCables(Fault):
     @property
     def channel_permutation(self) -> list[int]:
         """Index of the electrode on each channel."""
-        return [_electrode_index(electrode) for electrode in self.order]
+        return [electrode_index(electrode) for electrode in self.order]
 
 
 class SaturatedChannel(Fault):
     """Channel at an end of its range."""
 
     kind: Literal[FaultKind.SATURATED_CHANNEL] = FaultKind.SATURATED_CHANNEL
-    electrode: Electrode = Field(description="electrode of the channel")
+    electrode: Channel = Field(description="electrode of the channel")
     high: bool = Field(True, description="true: at the upper end; false: at the lower")
 
     @classmethod
@@ -289,7 +291,7 @@ class SaturatedChannel(Fault):
 
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to its limit."""
-        channel = _electrode_index(self.electrode)
+        channel = electrode_index(self.electrode)
         counts[:, channel] = limits[channel, int(self.high)]
 
 
@@ -297,7 +299,7 @@ class StuckChannel(Fault):
     """Channel that always reads the same count."""
 
     kind: Literal[FaultKind.STUCK_CHANNEL] = FaultKind.STUCK_CHANNEL
-    electrode: Electrode = Field(description="electrode of the channel")
+    electrode: Channel = Field(description="electrode of the channel")
     count: int | None = Field(None, description="the count; left out: the reading when it got stuck")
 
     @classmethod
@@ -308,7 +310,7 @@ class StuckChannel(Fault):
 
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to the count."""
-        channel = _electrode_index(self.electrode)
+        channel = electrode_index(self.electrode)
         if self.count is not None:
             counts[:, channel] = np.clip(self.count, *limits[channel])
 
@@ -337,7 +339,7 @@ class Offset(Fault):
     """Step of an amplifier's zero."""
 
     kind: Literal[FaultKind.OFFSET] = FaultKind.OFFSET
-    electrode: Electrode = Field(description="electrode of the channel")
+    electrode: Channel = Field(description="electrode of the channel")
     counts: float = Field(description="size of the step")
 
     @classmethod
@@ -348,7 +350,7 @@ class Offset(Fault):
 
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Add the offset."""
-        counts[:, _electrode_index(self.electrode)] += self.counts
+        counts[:, electrode_index(self.electrode)] += self.counts
         return counts
 
 
@@ -356,7 +358,7 @@ class GainStep(Fault):
     """Step of a channel's gain."""
 
     kind: Literal[FaultKind.GAIN_STEP] = FaultKind.GAIN_STEP
-    electrode: Electrode = Field(description="electrode of the channel")
+    electrode: Channel = Field(description="electrode of the channel")
     factor: Positive = Field(description="new gain relative to the old one")
 
     @classmethod
@@ -367,7 +369,7 @@ class GainStep(Fault):
 
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Apply the new gain."""
-        counts[:, _electrode_index(self.electrode)] *= self.factor
+        counts[:, electrode_index(self.electrode)] *= self.factor
         return counts
 
 
@@ -403,5 +405,8 @@ else:
     AnyFault = Annotated[Union[_ALL], Field(discriminator="kind")]  # noqa: UP007  of a tuple
 
 
-def _electrode_index(electrode: str) -> int:
+def electrode_index(electrode: str) -> int:
+    """Return the number of an electrode on a side, or of channel t1, t2 ... of a response."""
+    if electrode not in SIDE_ELECTRODES:
+        return int(electrode.removeprefix("t")) - 1
     return SIDE_ELECTRODES.index(electrode)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.problems import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
-from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch, discs
 from handtouch.simulate.gripper_objects import (
     GRIPPER_OBJECTS,
@@ -26,7 +25,7 @@ from handtouch.simulate.gripper_objects import (
     FingertipPositions,
     SoftBlock,
 )
-from handtouch.simulate.stimulus import AppliedContact
+from handtouch.simulate.stimulus import AppliedContact, EventlessStimulus
 
 FloatArray = NDArray[np.float64]
 FINGER_LINKS = {"thumb": "thumb_tip", "index": "index_tip"}
@@ -144,16 +143,8 @@ class GripperWorld:
         return before + fraction * (after - before)
 
 
-class GripperStimulus:
+class GripperStimulus(EventlessStimulus):
     """Contacts of a gripper world on the pads of a deployment; only present contacts are known."""
-
-    faults = ()
-    node_faults = ()
-    node_replacements = ()
-    skin: Skin | None = None
-    turns: Sequence[BaseTurn] = ()
-    repeat = False
-    duration_s = math.inf
 
     def __init__(self, world: GripperWorld, thumb: config.SurfaceTable, index: config.SurfaceTable) -> None:
         self.world = world
@@ -176,10 +167,6 @@ class GripperStimulus:
     def touch_links(self) -> Sequence[str]:
         """One touch per finger."""
         return list(FINGER_LINKS.values())
-
-    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
-        """Return the world's patch."""
-        return drawn
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:
         """Return the contacts at `t_s`, or the present ones if `t_s` is past."""

@@ -18,7 +18,6 @@ from handtouch.hand import urdf
 from handtouch.simulate.stimulus import JointTrajectory
 
 _PERIOD_S = 0.01
-Vector = tuple[float, float, float]
 _logger = logging.getLogger(__name__)
 
 
@@ -26,7 +25,7 @@ class JointFeed:
     """Sends the joint states of every hand with a URDF, from `start` until `close`.
 
     `trajectory` returns the reported motion of a hand's joints, or None; `scenario_time_s` is the time in the
-    scenario, at which `gravity` returns a hand's direction of gravity in its base, or None. If the daemon
+    scenario, at which `base_pose` returns the keywords of `send_joints` that a hand's base has. If the daemon
     rejects the connection, that is logged once and the thread ends.
     """
 
@@ -37,9 +36,9 @@ class JointFeed:
         scenario_time_s: Callable[[], float],
         endpoint: str,
         key: Path | str | None = None,
-        gravity: Callable[[config.HandTable, float], Vector | None] = lambda _, __: None,
+        base_pose: Callable[[config.HandTable, float], dict[str, tuple[float, ...]]] = lambda _, __: {},
     ) -> None:
-        self._gravity = gravity
+        self._base_pose = base_pose
         self._scenario_time_s, self._endpoint, self._key = scenario_time_s, endpoint, key
         self._hands = [
             (hand, joints)
@@ -75,4 +74,4 @@ class JointFeed:
                 hand.joint_names.get(name, hand.joint_prefix + name): position
                 for name, position in joints.positions_at(t_s).items()
             }
-            robot.send_joints(hand.name, positions, t_ns=sample_ns, gravity=self._gravity(hand, t_s))
+            robot.send_joints(hand.name, positions, t_ns=sample_ns, **self._base_pose(hand, t_s))

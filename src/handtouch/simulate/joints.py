@@ -12,8 +12,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from handtouch.config.base import Table
-from handtouch.config.tables import Positive
+from handtouch.config.base import Positive, Table
 from handtouch.hand import urdf
 from handtouch.simulate import noise
 from handtouch.simulate.smoothstep import smoothstep

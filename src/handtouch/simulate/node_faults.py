@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import AfterValidator, Field, model_validator
 
-from handtouch.config.base import Table
+from handtouch.config.base import Name, NonNegative, Positive, Table
 from handtouch.config.channels import parse_object
 from handtouch.config.eds import EdsError
-from handtouch.config.tables import Name, NonNegative, Positive, Unsigned32
+from handtouch.config.tables import Unsigned32
 from handtouch.device import Device
 from handtouch.wire.faults import FaultKind
 

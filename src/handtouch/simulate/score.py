@@ -87,11 +87,6 @@ class LinkScore:
     false_positives: int
     """Contacts that began without a touch."""
 
-    @property
-    def bound_ratio(self) -> float:
-        """Rms error relative to the rms bound."""
-        return self.rms_error_m / self.rms_bound_m
-
 
 @dataclass(frozen=True)
 class Score:

@@ -28,8 +28,8 @@ class SimulatedSheetHistory:
     """State of one sheet over time.
 
     total_force_n: (n,) at times (n,) of the scenario; temperature_rise_k: (n,) at times since the start.
-    force_times_s: times of the scenario at which the force is sampled; settling_times_s: those after which
-    the sheet settles; press_begins_s: those at which a press begins.
+    event_times_s: times of the scenario at which the force is sampled; those after which the sheet settles;
+    those at which a press begins.
     """
 
     def __init__(
@@ -38,15 +38,14 @@ class SimulatedSheetHistory:
         key: np.uint64,
         total_force_n: Callable[[FloatArray], FloatArray],
         temperature_rise_k: Callable[[FloatArray], FloatArray],
-        force_times_s: FloatArray,
-        settling_times_s: FloatArray,
-        press_begins_s: FloatArray,
+        event_times_s: tuple[FloatArray, FloatArray, FloatArray],
         repeat_period_s: float,
         begin_s: float = 0.0,
     ) -> None:
         self._law, self._noise_key = law, key
         self._total_force_n, self._temperature_rise_k = total_force_n, temperature_rise_k
         self._begin_s = begin_s
+        force_times_s, settling_times_s, press_begins_s = event_times_s
         self._repeat_period_s, self._press_begins_s = repeat_period_s, np.sort(press_begins_s)
         times = np.concatenate([force_times_s, (settling_times_s[:, None] + _SETTLING_KNOTS_S).ravel()])
         self._knots = np.unique(np.ceil(times / _MIN_KNOT_INTERVAL_S) * _MIN_KNOT_INTERVAL_S)

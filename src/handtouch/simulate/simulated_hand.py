@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.canbus.bus.port import open_bus
+from handtouch.config.base import MAX_CHANNELS
 from handtouch.config.channels import node_channels, parse_object
-from handtouch.config.tables import SIDE_ELECTRODES
+from handtouch.config.roles import column_channels
 from handtouch.device import Device, DeviceBus, Sampler
-from handtouch.device.inputs import MAX_CHANNELS
 from handtouch.hand.urdf import RobotDescription
-from handtouch.simulate.base_motion import gravity_in_base
+from handtouch.simulate.base_motion import base_pose
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
 from handtouch.simulate.joint_feed import JointFeed
@@ -125,10 +125,10 @@ class SimulatedHand:
             true = stimulus.joint_trajectory(robot)
             return ReportedJoints(true, robot, self._world, hand) if true else None
 
-        def gravity(hand: config.HandTable, t_s: float) -> tuple[float, float, float] | None:
-            return gravity_in_base(stimulus.turns, hand.gravity, t_s)
+        def pose(hand: config.HandTable, t_s: float) -> dict[str, tuple[float, ...]]:
+            return base_pose(stimulus.turns, hand.gravity, t_s)
 
-        feed = JointFeed(deployment, reported, scenario_time_s, endpoint, gravity=gravity)
+        feed = JointFeed(deployment, reported, scenario_time_s, endpoint, base_pose=pose)
         feed.start()
         self._resources.callback(feed.close)
 
@@ -207,16 +207,13 @@ class NodesOnBus:
             device = self.bus.add(
                 pad.node_id,
                 eds=node.eds,
-                vendor_id=node.vendor_id,
-                product_code=node.product_code,
+                kind=(node.vendor_id, node.product_code),
                 serial=pad.serial,
                 channels=tuple((c.index, c.sub) for c in channels),
                 counts_per_unit=tuple(c.counts_per_unit for c in channels),
                 excitation=parse_object(node.excitation_object)[:2] if node.excitation_object else None,
             )
-            wired = tuple(map(pad.electrode_names.index, pad.electrodes))
-            if pad.shear:
-                wired += tuple(len(wired) + SIDE_ELECTRODES.index(name) for name in pad.shear_electrodes)
+            wired = np.argsort(column_channels(pad)).tolist()  # columns by channels
             device.wiring = (*wired, *range(len(wired), MAX_CHANNELS))
             self.devices[f"{hand}/{pad.link}"] = device
 

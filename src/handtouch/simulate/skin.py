@@ -1,6 +1,6 @@
-"""Weight of the skin on the sheets of a simulated hand that moves: the currents that it presses through them.
+"""What a simulated hand that moves reads without a touch: its skin's weight, the Earth's magnetic field.
 
-Public names: `SkinLoad`, `LinkMotion`.
+Public names: `SkinLoad`, `FieldLoad`, `LinkMotion`, `link_motion`.
 
 Skin and drive plate lie loosely on the sheet: each piece presses by its own weight, and by its inertia, along
 the normal there, wherever that points down. What it presses through the layer is far less than the sheet
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.hand import urdf
+from handtouch.host.units import GRAVITY_M_S2
 from handtouch.simulate.base_motion import BaseTurn, axis_rotations, base_rotation
 from handtouch.simulate.pad_circuit import PadCircuit, layer_of
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.stimulus import JointTrajectory, Stimulus
 
 FloatArray = NDArray[np.float64]
-_GRAVITY_M_S2 = 9.80665
 _STEP_S = 0.01  # of the accelerations: motions of a hand are slower
 _NODES = 5  # along each side of a pad
 _KEPT_CHUNKS, _CHUNK_STEPS = 600, 100
@@ -76,7 +76,7 @@ class SkinLoad:
         if stimulus.skin is None:
             return None
         (table,) = (one for one in deployment.hands if one.name == hand)
-        motion = _link_motion(table, pad, stimulus)
+        motion = link_motion(table, pad, stimulus)
         return cls(10 * stimulus.skin.g_per_cm2, circuit, motion, *mount)
 
     def prepare(self, until_s: float) -> None:
@@ -89,6 +89,25 @@ class SkinLoad:
         felt = self._motion.felt_m_s2(scenario_s, self._centre_m)
         pressure = np.maximum(felt @ self._inward.T, 0.0) / self._reference_pa
         return np.asarray(pressure**self._alpha @ self._currents)
+
+
+class FieldLoad:
+    """Signals of the Earth's field on a magnetic pad by time.
+
+    axes: (n, 3) of the channels in the link's frame, as long as a field along them is read. field: its
+    direction (3,) in the base's frame at the start, when the sensor is zeroed.
+    """
+
+    def __init__(self, axes: FloatArray, field: FloatArray, motion: LinkMotion) -> None:
+        self._axes, self._field, self._motion = axes, field, motion
+        self._zero = motion.in_link(np.zeros(1), field)
+
+    def prepare(self, until_s: float) -> None:
+        """Do nothing: it is quick."""
+
+    def currents(self, scenario_s: FloatArray) -> FloatArray:
+        """Return the signals (n, m) of the channels at times (n,) of the scenario."""
+        return np.asarray((self._motion.in_link(scenario_s, self._field) - self._zero) @ self._axes.T)
 
 
 class LinkMotion:
@@ -106,7 +125,7 @@ class LinkMotion:
         gravity: FloatArray,
     ) -> None:
         self._chain, self._base_chain, self._joints, self._turns = chain, base_chain, joints, turns
-        self._gravity_m_s2 = _GRAVITY_M_S2 * gravity / np.linalg.norm(gravity)
+        self._gravity_m_s2 = GRAVITY_M_S2 * gravity / np.linalg.norm(gravity)
         self._steps = lru_cache(_KEPT_CHUNKS)(self._felt_in_chunk)
 
     def felt_m_s2(self, times_s: FloatArray, point_m: FloatArray) -> FloatArray:
@@ -122,6 +141,11 @@ class LinkMotion:
             first, part = before[at] - number * _CHUNK_STEPS, (step[at] - before[at])[:, None]
             felt[at] = (1 - part) * steps[first] + part * steps[first + 1]
         return felt
+
+    def in_link(self, times_s: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return a direction (3,) of the base's frame at the start in the link's frame (n, 3)."""
+        rotation = self._poses(np.maximum(times_s, 0.0))[0]
+        return np.asarray(direction @ rotation)
 
     def _felt_in_chunk(self, number: int, point_m: tuple[float, float, float]) -> FloatArray:
         """Return what is felt at the steps of a chunk, the first one of the next included."""
@@ -147,7 +171,7 @@ class LinkMotion:
         return to_start @ turned, (to_start @ (moved - origin)[:, :, None])[:, :, 0]
 
 
-def _link_motion(hand: config.HandTable, pad: config.Pad, stimulus: Stimulus) -> LinkMotion:
+def link_motion(hand: config.HandTable, pad: config.Pad, stimulus: Stimulus) -> LinkMotion:
     """Return the motion of a pad's link; without a URDF it moves with the base."""
     gravity = np.array(hand.gravity)
     if not hand.urdf:

@@ -2,11 +2,12 @@
 
 Implemented by `Scenario` (a file), `GraspStimulus` (a grasp in MuJoCo) and `GripperStimulus` (live commands).
 Public names: `Stimulus` (a whole hand), `PadStimulus` (one pad), `AppliedContact`, `JointTrajectory`,
-`NodeReplacement`.
+`NodeReplacement`, `EventlessStimulus` (a base).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol, Self
 
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from handtouch.config.base import Table
-from handtouch.config.tables import Name, Positive, PositivePerChannel, Unsigned32
+from handtouch.config.base import Name, Positive, PositivePerChannel, Table
+from handtouch.config.tables import Unsigned32
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
@@ -139,3 +140,19 @@ class Stimulus(Protocol):
 
     def check_links(self, links: Iterable[str], file: str = ...) -> None:
         """Raise ConfigError if a touch, fault or replacement names a link that carries no pad."""
+
+
+class EventlessStimulus:
+    """Base of a `Stimulus` without end and events other than contacts, whose patches are the world's."""
+
+    faults: Sequence[Fault] = ()
+    node_faults: Sequence[NodeFault] = ()
+    node_replacements: Sequence[NodeReplacement] = ()
+    skin: Skin | None = None
+    turns: Sequence[BaseTurn] = ()
+    repeat = False
+    duration_s = math.inf
+
+    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
+        """Return the world's patch."""
+        return drawn

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from handtouch.config.base import Table
-from handtouch.config.tables import Name, Positive
+from handtouch.config.base import Name, Positive, Table
 from handtouch.simulate.contact_patch import ContactPatch, Profile, discs
 from handtouch.simulate.smoothstep import smoothstep, smoothstep_array
 
@@ -50,6 +49,11 @@ class ScenarioTouch(Table):
     radius_mm: Positive | None = Field(
         None, description="contact radius, of a round, even patch unless stated; left out: the world's patch"
     )
+    hertz_force_n: Positive | None = Field(
+        None,
+        description="force at which the patch has radius_mm, from which it grows as force^(1/3), as under a "
+        "round tip; left out: it doesn't grow",
+    )
     profile: Profile | None = Field(
         None, description="how the pressure is distributed over the patch; left out: the world's"
     )
@@ -63,7 +67,9 @@ class ScenarioTouch(Table):
 
     def patch(self, drawn: ContactPatch) -> ContactPatch:
         """Return the touch's patch; `drawn`: the world's, for what it leaves out."""
-        made = drawn if self.radius_mm is None else ContactPatch(1e-3 * self.radius_mm)
+        made = drawn
+        if self.radius_mm is not None:
+            made = ContactPatch(1e-3 * self.radius_mm, hertz_force_n=self.hertz_force_n)
         stated: dict[str, Any] = {
             "profile": self.profile,
             "elongation": self.elongation,

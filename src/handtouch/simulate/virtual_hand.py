@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.config.roles import channel_count
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
-from handtouch.simulate.channel_errors import ChannelErrors
 from handtouch.simulate.contact_patch import ContactPatch
-from handtouch.simulate.electronics_drift import ElectronicsDrift
 from handtouch.simulate.faults import Fault
-from handtouch.simulate.pad_circuit import layer_of
+from handtouch.simulate.pad_circuit import PadCircuit, layer_of
 from handtouch.simulate.pad_geometry import SimulatedSurface
+from handtouch.simulate.response_circuit import ResponseCircuit
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.solved_contact import (
     ContactLayer,
@@ -39,7 +39,7 @@ from handtouch.simulate.solved_contact import (
 from handtouch.simulate.stimulus import AppliedContact, Stimulus
 from handtouch.simulate.truth import GroundTruth, Vector
 from handtouch.simulate.unevenness import wave_ratio
-from handtouch.simulate.virtual_pad import VirtualPad
+from handtouch.simulate.virtual_pad import VirtualPad, channel_errors_of, drift_of
 from handtouch.simulate.worlds import DrawnWorld
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +54,7 @@ class VirtualHand:
     Rows are the pads in the order of the file, columns their channels, of the pad that has most: those that
     others lack read 0. `pads` are (hand's name, pad), `virtual_pads` their models.
     `faults` are added to those of
-    the stimulus.
+    the stimulus. Models of second sheets follow those of the pads.
     """
 
     def __init__(
@@ -72,36 +72,44 @@ class VirtualHand:
             VirtualPad.build(deployment, hand, pad, stimulus, world, all_faults) for hand, pad in self.pads
         ]
         self._shear_rows = [(k, pad.shear) for k, pad in enumerate(self.virtual_pads) if pad.shear]
-        self._bank = SheetMapBank([row.circuit.maps for row in self.virtual_pads])
-        self._circuits = _HealthyCircuits(self.virtual_pads)
+        # second sheets follow the pads, as rows of their own under the same contacts
+        firsts = [row for row, (_, pad) in enumerate(self.pads) if pad.second_sheet]
+        self._second_rows = {row: len(self.pads) + number for number, row in enumerate(firsts)}
+        self.virtual_pads += [self.virtual_pads[row].build_second(deployment, all_faults) for row in firsts]
+        are_sheets = np.array([isinstance(row.circuit, PadCircuit) for row in self.virtual_pads])
+        sheets = [row for row, is_sheet in zip(self.virtual_pads, are_sheets, strict=True) if is_sheet]
+        self._sheet_number = np.cumsum(are_sheets) - 1
+        """(rows,), numbers of those that are sheets with electrodes"""
+        self._circuits = _HealthyCircuits(sheets) if sheets else None
+        self._bank = SheetMapBank(self._circuits.maps) if self._circuits else None
         self._noise = np.array([row.noise_counts for row in self.virtual_pads])
         self._keys = _padded([row.noise_keys for row in self.virtual_pads])
         self._gains = _padded([row.counts_per_ampere for row in self.virtual_pads])
         self._low = _padded([row.limits[:, 0] for row in self.virtual_pads])
         self._high = _padded([row.limits[:, 1] for row in self.virtual_pads])
         self._sample_count = 0
-        self._drift = ElectronicsDrift(
-            world,
-            [(row.hand, row.pad.link) for row in self.virtual_pads],
-            [row.pad.electrode_names for row in self.virtual_pads],
-        )
-        self._errors = ChannelErrors(
-            world,
-            [(row.hand, row.pad.link) for row in self.virtual_pads],
-            [len(row.pad.electrode_names) for row in self.virtual_pads],
-            [float(row.limits[:, 1].min()) for row in self.virtual_pads],
-        )
+        self._drift = drift_of(self.virtual_pads, world)
+        self._errors = channel_errors_of(self.virtual_pads, world)
         self._special_rows = [
             number
             for number, row in enumerate(self.virtual_pads)
-            if row.faults or row.replacement_gains or row.new_sheets or row.circuit.states
+            if row.faults or row.replacement_gains or row.new_sheets or row.circuit.states or row.pad.response
         ]
-        self._skin_rows = [number for number, row in enumerate(self.virtual_pads) if row.skin]
+        self._loaded_rows = [
+            number
+            for number, row in enumerate(self.virtual_pads)
+            if row.load and number not in self._special_rows
+        ]
         self._touch_pads = [
             [
-                (number, stimulus.touch_patch(index, world.contact(row.sheet, index).patch))
-                for number, row in enumerate(self.virtual_pads)
-                if row.pad.link == link
+                (
+                    row,
+                    stimulus.touch_patch(index, world.contact(self.virtual_pads[number].sheet, index).patch),
+                )
+                for number, (_, pad) in enumerate(self.pads)
+                if pad.link == link
+                for row in (number, self._second_rows.get(number))
+                if row is not None
             ]
             for index, link in enumerate(stimulus.touch_links)
         ]
@@ -109,7 +117,7 @@ class VirtualHand:
     def sample(self, t_s: float) -> NDArray[np.int64]:
         """Return counts (pads, c) of the channels, `t_s` after the start of the scenario.
 
-        Those of a pad's shear pad follow its own.
+        Those of a pad's shear pad and its second sheet follow its own.
         """
         self._sample_count += 1
         if history := self.virtual_pads[self._sample_count % len(self.virtual_pads)].history:
@@ -120,24 +128,39 @@ class VirtualHand:
         special = {*self._special_rows, *(row for row, number in contact_counts.items() if number > 1)}
         if contacts := [contact for contact in all_contacts if contact.row not in special]:
             solved = self._solve(contacts, t_s)
-            counts[solved.rows] += solved.currents_a * gains[solved.rows]
-        for row in self._skin_rows:
-            currents = self.virtual_pads[row].skin_currents(np.array([t_s]))[0]
+            own = slice(solved.shares.shape[1])
+            counts[solved.rows, own] += solved.currents_a * gains[solved.rows, own]
+        for row in self._loaded_rows:
+            currents = self.virtual_pads[row].load_currents(np.array([t_s]))[0]
             counts[row, : len(currents)] += currents * gains[row, : len(currents)]
         readings = self.quantise(counts)
         for row in special:
             own = self.counts(row, [t_s])[0]
             readings[row, : len(own)] = own
-        return self._beside_shear(readings, t_s) if self._shear_rows else readings
+        return self._with_others(readings, t_s) if self._shear_rows or self._second_rows else readings
 
-    def _beside_shear(self, readings: NDArray[np.int64], t_s: float) -> NDArray[np.int64]:
-        """Return readings with those of each pad's shear pad after its own channels."""
-        widened = np.zeros((len(readings), readings.shape[1] + len(SIDE_ELECTRODES)), np.int64)
-        widened[:, : readings.shape[1]] = readings
+    def _with_others(self, readings: NDArray[np.int64], t_s: float) -> NDArray[np.int64]:
+        """Return readings with those of each pad's shear pad and second sheet after its own channels."""
+        more = max(channel_count(pad) - len(pad.electrode_names) for _, pad in self.pads)
+        widened = np.zeros((len(self.pads), readings.shape[1] + more), np.int64)
+        widened[:, : readings.shape[1]] = readings[: len(self.pads)]
+        ends = [len(row.limits) for row in self.virtual_pads]
         for row, shear in self._shear_rows:
-            first = len(self.virtual_pads[row].limits)
-            widened[row, first : first + len(SIDE_ELECTRODES)] = shear.counts(np.array([t_s]))[0]
+            first, ends[row] = ends[row], ends[row] + len(SIDE_ELECTRODES)
+            widened[row, first : ends[row]] = shear.counts(np.array([t_s]))[0]
+        for row, second in self._second_rows.items():
+            widened[row, ends[row]] = readings[second, 0]
         return widened
+
+    def all_counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
+        """Return counts (n, m) of all channels of one pad at times (n,): electrodes, shear pad, second
+        sheet."""
+        made, shear = [self.counts(pad_row, times_s)], self.virtual_pads[pad_row].shear
+        if shear:
+            made.append(shear.counts(np.asarray(times_s, np.float64)))
+        if pad_row in self._second_rows:
+            made.append(self.counts(self._second_rows[pad_row], times_s))
+        return np.hstack(made)
 
     def untouched_counts(self, t_s: float, hands: int = 1) -> FloatArray:
         """Return zeros and noise (hands, pads, c) [counts] at `t_s`, of hands that differ in noise only; the
@@ -183,23 +206,36 @@ class VirtualHand:
 
         It is on from the start.
         """
-        row = self.virtual_pads[pad_row]
-        for pad in (row, *row.new_sheets):
+        row, second = self.virtual_pads[pad_row], self._second_rows.get(pad_row)
+        seconds = () if second is None else (self.virtual_pads[second],)
+        for pad in (row, *row.new_sheets, *seconds):
             if history := pad.history:
                 history.switch_excitation(t_s, on)
 
     def truth(self, t_s: float, sync_ns: int = 0) -> list[GroundTruth]:
         """Return the true contacts of the sample at `t_s`; `sync_ns` is its SYNC on the host's clock."""
-        contacts = self._contacts_at(t_s)
-        if not contacts:
-            return []
-        solved = self._solve(contacts, t_s)
-        return [
-            self._truth(contact, currents, jacobian, sync_ns, t_s)
-            for contact, currents, jacobian in zip(
-                contacts, solved.currents_a, self._jacobian(solved), strict=True
-            )
-        ]
+        contacts = [contact for contact in self._contacts_at(t_s) if contact.row < len(self.pads)]
+        signals = self._signals(contacts, t_s)
+        return [self._truth(*one, sync_ns, t_s) for one in zip(contacts, *signals, strict=True)]
+
+    def _signals(
+        self, contacts: Sequence[_PadContact], t_s: float
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the signals of each contact alone, and their derivatives by x, y and strength."""
+        circuits = [self.virtual_pads[one.row].circuit for one in contacts]
+        on_sheets = [k for k, circuit in enumerate(circuits) if isinstance(circuit, PadCircuit)]
+        signals: list[FloatArray] = [np.zeros(0)] * len(contacts)
+        jacobians = list(signals)
+        if on_sheets:
+            solved = self._solve([contacts[k] for k in on_sheets], t_s)
+            for k, own, jacobian in zip(on_sheets, solved.currents_a, self._jacobian(solved), strict=True):
+                signals[k], jacobians[k] = own, jacobian
+        for k, (circuit, contact) in enumerate(zip(circuits, contacts, strict=True)):
+            if isinstance(circuit, ResponseCircuit):
+                applied = contact.contact
+                at = applied.x, applied.y, applied.force_n
+                signals[k], jacobians[k] = circuit.signals_with_jacobian(*at, contact.column)
+        return signals, jacobians
 
     def _contacts_at(self, t_s: float) -> list[_PadContact]:
         return [
@@ -231,7 +267,7 @@ class VirtualHand:
         `ContactPatch.column`. force: (k,), apparent [N].
         """
         if not len(rows):
-            return np.zeros((0, self._circuits.share_to_channel.shape[1]))
+            return np.zeros((0, self._gains.shape[1]))
         return self._solve_patches(rows, position, patch, force).currents_a
 
     def _solve_patches(
@@ -245,18 +281,22 @@ class VirtualHand:
         nodes = parts[0]
         if len(parts) > 1:
             nodes = PatchNodes.joined(parts).taken(np.argsort(np.concatenate(groups)))
-        log_radius, shares = look_up_nodes(self._bank, rows, nodes)
-        sheet_ohm, layer = self._circuits.sheets(rows, position)
+        assert self._bank is not None
+        assert self._circuits is not None
+        own = self._sheet_number[rows]
+        log_radius, shares = look_up_nodes(self._bank, own, nodes)
+        sheet_ohm, layer = self._circuits.sheets(own, position)
         number = np.arange(len(rows))
         ohm, mean, by_node = solve_patches(nodes, log_radius, shares, number, force, sheet_ohm, layer)
-        return _SolvedContacts(rows, nodes, by_node, *self._circuits.solve_contacts(rows, mean, ohm))
+        return _SolvedContacts(rows, nodes, by_node, *self._circuits.solve_contacts(own, mean, ohm))
 
     def _jacobian(self, solved: _SolvedContacts) -> FloatArray:
         """Return the currents' derivatives (k, c, 3) by x, y [fractions] and total current."""
-        slopes = node_slopes(self._bank, solved.rows, solved.nodes)
-        by_position = self._circuits.share_to_channel[solved.rows] @ np.einsum(
-            "makn,kn->kma", slopes, solved.by_node
-        )
+        assert self._bank is not None
+        assert self._circuits is not None
+        own = self._sheet_number[solved.rows]
+        slopes = node_slopes(self._bank, own, solved.nodes)
+        by_position = self._circuits.share_to_channel[own] @ np.einsum("makn,kn->kma", slopes, solved.by_node)
         return np.concatenate(
             [solved.total_a[:, None, None] * by_position, solved.shares[:, :, None]], axis=2
         )
@@ -271,7 +311,7 @@ class VirtualHand:
         x, y = nodes.centres(shape, at)[:, 0].tolist()
         s_m, phi = x * shape.length_m, y * shape.arc
         point, normal = shape.point(s_m, phi), shape.normal(s_m, phi)
-        in_counts = jacobian * self._gains[contact.row][:, None]
+        in_counts = jacobian * self._gains[contact.row][: len(jacobian), None]
         in_counts[:, :2] @= np.linalg.inv(shape.metres_per_fraction(x, y))
         variance = row.noise_counts**2 + _QUANTISATION_VARIANCE
         covariance = variance * np.linalg.inv(in_counts.T @ in_counts)
@@ -340,17 +380,23 @@ class _SolvedContacts(NamedTuple):
 
 
 class _HealthyCircuits:
-    """Circuits of all pads without faults: supply, contact, sheet, resistors."""
+    """Circuits of all sheets with electrodes without faults: supply, contact, sheet, resistors."""
 
     def __init__(self, rows: Sequence[VirtualPad]) -> None:
-        self._drive_v = np.array([row.circuit.drive_v for row in rows])
-        self._sheet_ohm = np.array([row.sheet.ohm_per_square for row in rows])
-        self._layers = np.array([layer_of(row.sheet) for row in rows]).T
-        circuits = [row.circuit.healthy for row in rows]
+        pads = [row.circuit for row in rows if isinstance(row.circuit, PadCircuit)]
+        self.maps = [pad.maps for pad in pads]
+        self._drive_v = np.array([pad.drive_v for pad in pads])
+        self._sheet_ohm = np.array([pad.sheet.ohm_per_square for pad in pads])
+        self._layers = np.array([layer_of(pad.sheet) for pad in pads]).T
+        circuits = [pad.healthy for pad in pads]
         self._impedance_ohm = _padded([circuit.impedance_ohm for circuit in circuits])
         self.share_to_channel = _padded([circuit.share_to_channel for circuit in circuits])
         """(rows, c, c): from the shares of grounded electrodes to those of the channels."""
-        uneven = [row.circuit.unevenness for row in rows]
+        for number, row in enumerate(rows):
+            if row.is_total:
+                self.share_to_channel[number, 0] = self.share_to_channel[number].sum(axis=0)
+                self.share_to_channel[number, 1:] = 0.0
+        uneven = [pad.unevenness for pad in pads]
         self._modes = max((one.modes for one in uneven), key=len)
         self._amplitudes = _padded([np.array(one.amplitudes) for one in uneven]).T
         """(modes, rows)"""

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.config.channels import node_channels, shear_numbers
+from handtouch.config.channels import node_channels
+from handtouch.config.roles import SHEAR, channel_numbers
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
@@ -45,7 +46,7 @@ class VirtualShear:
         self._electrodes = SimulatedShearPad(self._shear, node.drive_v, self._hidden)
         shape = world.surface(hand, pad)
         self._size_m = np.diag(shape.metres_per_fraction(0.5, 0.5))
-        channels, numbers = node_channels(node), list(shear_numbers(pad))
+        channels, numbers = node_channels(node), list(channel_numbers(pad, SHEAR))
         self._limits = np.array([channels[number].limits for number in numbers])
         full = np.array([node.full_scale_counts or high for high in self._limits[:, 1]])
         scale = np.array([node.channel_scale[number] for number in numbers])

@@ -14,6 +14,7 @@ from handtouch.calibration.calibration import Gains
 from handtouch.config import Deployment
 from handtouch.supervisor import diagnose
 from handtouch.supervisor.ipc import FloatArray, SampleBlock
+from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 
 _BLOCK_DURATION_NS, _BLOCK_TICKS = 250_000_000, 20
@@ -66,7 +67,7 @@ class DeploymentDiagnostics:
             self._diagnoses += [
                 (rows.start + row, diagnosis.published)
                 for row, diagnosis in hand.diagnoses_by_pad()
-                if diagnosis.is_fault and not self._switched[rows.start + row]
+                if diagnosis.kind != FaultKind.HELD_OBJECT and not self._switched[rows.start + row]
             ]
         return self._diagnoses
 

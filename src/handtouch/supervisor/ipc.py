@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
-from handtouch.calibration.auto_calibration import CalibrationState
 from handtouch.calibration.calibration import (
-    MAX_CHANNELS,
     MAX_GAIN,
-    MIN_CHANNELS,
     MIN_GAIN,
+    CalibrationState,
     ChannelValues,
     LearnedParts,
 )
 from handtouch.config import Table
+from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS
 from handtouch.sheet import BANK_LEARNED, check_learned
 from handtouch.wire.health import Diagnosis
 
@@ -122,7 +121,8 @@ class CalibrationUpdate(Table):
 
     covariance: (c, c) of the log gains of c channels, row by row; None, as the deployment states. parts: of
     the pad, learned with the gains; None, as the deployment states. If known: offset_counts and their
-    standard deviations, per channel; contact law; back_n, back_std_n: back force [N] of its sheet; learned:
+    standard deviations, per channel; contact laws of the
+    pad's sheet and of its second one; back_n, back_std_n: back force [N] of its sheet; learned:
     its behaviour, as `sheet.ModelBank.learned`, or empty. new_sheet: the node has another sheet than before,
     so law, state and evidence of the old one don't hold.
     """
@@ -137,6 +137,7 @@ class CalibrationUpdate(Table):
     offset_counts: ChannelValues | None = None
     offset_std: ChannelValues | None = None
     law: ContactLawMessage | None = None
+    second_law: ContactLawMessage | None = None
     back_n: Annotated[float, Field(ge=0)] | None = None
     back_std_n: Annotated[float, Field(ge=0)] = 0.0
     learned: tuple[float, ...] = ()

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from handtouch.calibration.auto_calibration import AutoCalibrator, CalibrationState
+from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.calibration import (
     NEW_SHEET_METHOD,
+    CalibrationState,
     CalibrationVersion,
     Gains,
     Provenance,
@@ -27,13 +28,22 @@ from handtouch.calibration.calibration import (
     channel_values,
     matrix,
 )
+from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.config import Deployment
 from handtouch.core.least_threshold import LevelScatter, least_begin_counts
 from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
-from handtouch.hand import models_with_other_parts, network_parameters, pad_network, part_limits, part_stds
+from handtouch.field.model import ChannelModel
+from handtouch.hand import (
+    channel_gain_std,
+    models_with_other_parts,
+    network_parameters,
+    pad_channels,
+    part_limits,
+    part_stds,
+)
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
 from handtouch.supervisor.ipc import (
     MAX_DIAGNOSES,
@@ -105,19 +115,20 @@ class SupervisorWorker:
         self, deployment: Deployment, store: StoreClient, diagnostics: DeploymentDiagnostics | None = None
     ) -> None:
         entries = deployment.pads
-        models: dict[object, tuple[Any, ...]] = {}
+        models: dict[object, tuple[ChannelModel, PartModels, tuple[float, ...], float]] = {}
         self._pads = []
         most = max(len(pad.electrode_names) for _, pad in entries)
         self._ampere_per_count = np.zeros((len(entries), most))
         """(n, c) without any calibration, 0 beyond a pad's own channels"""
         for number, (hand, pad) in enumerate(entries):
-            design, sheet = (network_parameters(pad), pad.sheet, pad.node), deployment.sheets[pad.sheet]
+            design, sheet = (network_parameters(pad), pad.sheet, pad.node), deployment.sheet_of(pad)
             node, scale = deployment.nodes[pad.node], np.array(ampere_per_count_of(pad, deployment))
             self._ampere_per_count[number, : len(scale)] = scale
             if design not in models:
-                network = pad_network(pad, sheet)
-                others = models_with_other_parts(network, pad, node, sheet)
-                models[design] = network, others, part_stds(pad, node, sheet), part_limits(pad, node)
+                network = pad_channels(pad, sheet, node)
+                parts = PartModels(models_with_other_parts(network, pad, node, sheet), part_limits(pad, node))
+                stds, gain_std = part_stds(pad, node, sheet), channel_gain_std(pad, node)
+                models[design] = network, parts, stds, gain_std
             mounting_point = MountingPoint(hand, pad.link, default_calibration_id_of(pad, deployment))
             detector = StationaryContactDetector(noise_counts_of(node) * scale)
             calibrator = AutoCalibrator(*models[design])
@@ -126,8 +137,7 @@ class SupervisorWorker:
             )
         self._store, self._diagnostics = store, diagnostics
         self._store_schedule = StoreSchedule([row.channels for row in self._pads])
-        touches = [pad.touch or deployment.touch for _, pad in entries]
-        self._level_scatter = LevelScatter([round(1e6 * touch.begin_ms) for touch in touches])
+        self._level_scatter = LevelScatter([deployment.touch_of(pad).begin_ms for _, pad in entries])
         self._diagnoses: dict[int, list[Diagnosis]] = {}
         self._dead_electrodes: Mapping[int, int] = {}
         self._latest_sync_ns = self._status_sent_ns = self._store_polled_ns = 0
@@ -315,6 +325,7 @@ class SupervisorWorker:
         if (
             serial is None
             or not row.calibrator.can_learn
+            or row.calibrator.sheet_replaced
             or row.calibrator.calibration_state not in (CalibrationState.DEFAULT, CalibrationState.CALIBRATED)
         ):
             return
@@ -380,8 +391,9 @@ class SupervisorWorker:
         if version.provenance.method == NEW_SHEET_METHOD:
             found["new_sheet"] = True
             self._store_schedule.reset_pad(pad)  # what is due is of the old sheet
-        if known.law:
-            found["law"] = ContactLawMessage.model_validate(asdict(known.law))
+        for name in ("law", "second_law"):
+            if law := getattr(known, name):
+                found[name] = ContactLawMessage.model_validate(asdict(law))
         if sheet := restored_sheet(version, age_s(version, now)):
             found |= sheet._asdict()
         return update.model_copy(update=found)

@@ -166,6 +166,7 @@ _MAIN_VALUE = {
     "shape": "radius_m",
     "friction": "ratio",
     "object": "position_std_m",
+    "stiffness": "modulus_per_radius_pa_per_m",
 }
 """Kind of a percept -> its principal value."""
 _CONFIDENCE_STEP = 0.05

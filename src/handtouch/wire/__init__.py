@@ -40,6 +40,7 @@ from handtouch.wire.health import (
     Health,
     JointPositions,
     NodeStateName,
+    SecondSheetStatusName,
     ShearStatusName,
 )
 from handtouch.wire.percept_input import PerceptInput
@@ -47,6 +48,7 @@ from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
 from handtouch.wire.sequence import SequenceTracker
 from handtouch.wire.service import Service
 from handtouch.wire.status import (
+    ContactRadiusStatus,
     ForceStatus,
     FrameStatus,
     PadState,
@@ -86,6 +88,7 @@ __all__ = [
     "Contact",
     "ContactEvent",
     "ContactPart",
+    "ContactRadiusStatus",
     "EncodedMessage",
     "EndReason",
     "ForceStatus",
@@ -105,6 +108,7 @@ __all__ = [
     "PerceptKind",
     "PositionStatus",
     "Raw",
+    "SecondSheetStatusName",
     "SequenceTracker",
     "Service",
     "ShearStatusName",

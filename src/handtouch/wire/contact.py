@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from handtouch.wire.columns import Column, HandColumn
 from handtouch.wire.declarations import CLOSED
 from handtouch.wire.status import (
+    ContactRadiusStatus,
+    ContactRadiusStatusName,
     ForceStatus,
     ForceStatusName,
     FrameStatus,
@@ -36,12 +38,12 @@ List36 = Annotated[list[float], Matrix6]
 EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", "stopped", ""]
 ContactEvent = Literal["begin", "update", "end"]
 
-PerceptKind = Literal["motion", "shape", "friction", "object", "action_request"]
-PERCEPT_KINDS = ("motion", "shape", "friction", "object")
+PerceptKind = Literal["motion", "shape", "friction", "object", "stiffness", "action_request"]
+PERCEPT_KINDS = ("motion", "shape", "friction", "object", "stiffness")
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"
 """Kind of percept that requests an action of the robot"""
-EXPERIMENTAL_PERCEPTS = frozenset({"shape", "object", ACTION_REQUEST})
+EXPERIMENTAL_PERCEPTS = frozenset({"shape", "object", "stiffness", ACTION_REQUEST})
 """Kinds of percepts of which too little is known in the world `default` to rely on them."""
 MAX_POSES = 8
 """Most hypotheses in `poses`"""
@@ -241,6 +243,33 @@ class Contact:
     mount_covariance_m2: Annotated[Matrix3 | None, HandColumn()] = None
     """part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
     the pad, so that the difference of two positions has the rest"""
+    contact_radius_status: Annotated[
+        ContactRadiusStatusName, ContactRadiusStatus, HandColumn("status of the contact's radius")
+    ] = ContactRadiusStatus.NOT_COMPUTED.text
+    """status of the two that follow"""
+    contact_radius_m: Annotated[float | None, HandColumn("radius of the contact")] = None
+    """radius of the contact, of a disc as large: estimated with the force on a pad with two sheets, else that
+    which `force_n` is for"""
+    contact_radius_std_m: Annotated[float | None, HandColumn("its standard deviation")] = None
+    """standard deviation of `contact_radius_m`"""
+    length_m: Annotated[
+        float | None, HandColumn("length of the line that is as elongated; NaN where nothing is known of it")
+    ] = None
+    """length of the line that is as elongated: 0 of a round contact, of a rectangle the root of the
+    difference of its sides' squares. On a pad of four electrodes that of the shortest line that explains the
+    currents, along `length_axis`; this and the four that follow are absent where they aren't known, as with
+    `parts`"""
+    min_length_m: Annotated[float | None, HandColumn("lower end of its interval of 95 %")] = None
+    """lower end of the interval of 95 % of `length_m`"""
+    max_length_m: Annotated[float | None, HandColumn("upper end of its interval of 95 %")] = None
+    """upper end of that interval; absent on a pad of four electrodes, which show one combination of length
+    and direction"""
+    length_axis: Annotated[Vector3 | None, HandColumn("unit vector along it, in the link's frame")] = None
+    """unit vector along the contact, of either sign, in the link's frame; absent if the currents are those of
+    a round one"""
+    length_axis_std_rad: Annotated[float | None, HandColumn("standard deviation of its direction")] = None
+    """standard deviation of its direction in the pad's plane; 0.45 on a pad of four electrodes: within 45
+    degrees"""
 
 
 @dataclass(frozen=True, slots=True)

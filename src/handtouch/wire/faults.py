@@ -41,6 +41,7 @@ class FaultKind(StrEnum):
     CHANGED_SETTING = "changed_setting", "object changed by another master or a configuration tool"
     # diagnosed from a pad's samples only
     HELD_OBJECT = "held_object", "object held by the hand; no fault"
+    STATIC_LOAD = "static_load", "load that stays: probably gum, or an object that is held still"
     HYSTERESIS_TAIL = "hysteresis_tail", "slowly fading remainder of a press"
     COMMON_DRIFT = "common_drift", "drift shared with other pads: temperature or supply"
     UNEXPLAINED = "unexplained", "static load or contacts that no known fault explains"
@@ -49,6 +50,7 @@ class FaultKind(StrEnum):
     # diagnosed from serial numbers, the calibration and the excitation
     NODE_REPLACED = "node_replaced", "node with another serial number than before"
     GAINS_CHANGED = "gains_changed", "channel gains that no longer match the calibration"
+    SHEET_REPLACED = "sheet_replaced", "sheet that probably isn't the calibrated one"
     FOREIGN_CALIBRATION = "foreign_calibration", "calibration taken over from another node"
     STORE_UNAVAILABLE = "store_unavailable", "calibration store that can't be read or written"
     SHEET_ADAPTED = "sheet_adapted", "sheet adapted to load; excitation off while it recovers"

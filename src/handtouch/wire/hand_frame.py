@@ -5,7 +5,7 @@ from typing import Annotated
 
 from handtouch.wire.columns import Column
 from handtouch.wire.contact import HandFrameHead
-from handtouch.wire.status import ForceStatus, FrameStatus, PositionStatus
+from handtouch.wire.status import ContactRadiusStatus, ForceStatus, FrameStatus, PositionStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,3 +68,19 @@ class HandFrame(HandFrameHead):
     """the force in the base's frame"""
     mount_covariance_m2: Annotated[bytes, Column("<f4", 9)] = b""
     """as in `contact`"""
+    contact_radius_status: Annotated[bytes, Column("<u1", codes=ContactRadiusStatus)] = b""
+    """status of the contact's radius"""
+    contact_radius_m: Annotated[bytes, Column("<f4")] = b""
+    """radius of the contact"""
+    contact_radius_std_m: Annotated[bytes, Column("<f4")] = b""
+    """its standard deviation"""
+    length_m: Annotated[bytes, Column("<f4")] = b""
+    """length of the line that is as elongated; NaN where nothing is known of it"""
+    min_length_m: Annotated[bytes, Column("<f4")] = b""
+    """lower end of its interval of 95 %"""
+    max_length_m: Annotated[bytes, Column("<f4")] = b""
+    """upper end of its interval of 95 %"""
+    length_axis: Annotated[bytes, Column("<f4", 3)] = b""
+    """unit vector along it, in the link's frame"""
+    length_axis_std_rad: Annotated[bytes, Column("<f4")] = b""
+    """standard deviation of its direction"""

@@ -13,6 +13,7 @@ NodeStateName = Literal[
 ]
 CalibrationStateName = Literal["default", "calibrated", "quarantined", "manual_required", ""]
 AdaptationStatusName = Literal["compensated", "rejected", ""]
+SecondSheetStatusName = Literal["operational", "no_zero", "dead", "saturated", "stuck", "contradictory", ""]
 ShearStatusName = Literal["operational", "no_rest", "dead", "saturated", "shorted", ""]
 
 
@@ -145,6 +146,11 @@ class Health:
     least_begin_threshold_n: float | None = None
     """lower bound of the `begin_threshold_n` with one false contact in 100 hours, by noise and drift of the
     pad while untouched; absent in its first minute"""
+    second_sheet_status: SecondSheetStatusName = ""
+    """channel of the second sheet: `operational`; `no_zero`: its zero isn't known yet; under the last touch
+    `dead`: it had no current; `saturated`: it was at the end of its range; `stuck`: its counts never changed;
+    `contradictory`: no expected radius explains both sheets. Absent without one. Forces are those of the
+    first sheet unless it is `operational`"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,8 @@ _HANDS_PREFIX, _JOINTS_PREFIX = "hands/", "hand_joints/"
 class JointState:
     """`joints/<hand>`: measured joint positions; any subset of the hand's joints, and other joints too.
 
-    Arrays are (m,), `gravity` is (3,). Raises ValueError for values that violate the contract.
+    Arrays are (m,), `gravity` is (3,), `orientation` (4,). Raises ValueError for values that violate the
+    contract.
     """
 
     hand: str
@@ -56,6 +57,9 @@ class JointState:
     gravity: FloatArray | None = None
     """x, y, z: direction of gravity in the frame of the hand's base, of any length; for a base that moves,
     instead of the deployment's `gravity`"""
+    orientation: FloatArray | None = None
+    """x, y, z, w: quaternion of the hand's base in a frame fixed to the ground, of any length; for a base
+    that moves, by which zeros of magnetic pads are compensated"""
 
     def __post_init__(self) -> None:
         _check_time(self.t_ns)
@@ -64,8 +68,9 @@ class JointState:
             _check_length(key, getattr(self, key), "names", self.names)
         _check_column("position_std_rad", self.position_std_rad, "names", self.names)
         _check_std("position_std_rad", self.position_std_rad)
-        if self.gravity is not None:
-            object.__setattr__(self, "gravity", _unit_vector("gravity", self.gravity))
+        for key, length in (("gravity", 3), ("orientation", 4)):
+            if (vector := getattr(self, key)) is not None:
+                object.__setattr__(self, key, _unit_vector(key, vector, length))
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +187,9 @@ def _check_std(key: str, column: FloatArray | None) -> None:
         raise ValueError(f"{key} must be greater than 0")
 
 
-def _unit_vector(key: str, vector: FloatArray) -> FloatArray:
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise ValueError(f"{key} must be a list of 3 finite numbers")
+def _unit_vector(key: str, vector: FloatArray, length: int) -> FloatArray:
+    if vector.shape != (length,) or not np.isfinite(vector).all():
+        raise ValueError(f"{key} must be a list of {length} finite numbers")
     largest = np.abs(vector).max()
     if largest == 0:
         raise ValueError(f"{key} must be a direction: not all components may be 0")

@@ -77,6 +77,10 @@ class PerceptInput:
     """as in `contact`, of contacts above shear pads whose position is valid and whose force no lower bound"""
     force_vector_covariance_n2: Annotated[bytes, Column("<f8", 9)] = b""
     """its covariance, row by row"""
+    contact_radius_m: Annotated[bytes, Column("<f8")] = b""
+    """as in `contact`, of contacts whose radius and force are valid by both sheets of their pad"""
+    contact_radius_std_m: Annotated[bytes, Column("<f8")] = b""
+    """its standard deviation"""
     clear: Annotated[bytes, Column("<u1")] = b""
     """1 for every link whose pad is sampled and untouched; this and the following are present 20 times a
     second, while `object` is requested"""

@@ -32,6 +32,8 @@ class Raw:
     fresh: Annotated[bytes, Column("<u1")]
     """1 where the sample belongs to this tick"""
     retained: bool
+    second_counts: Annotated[bytes, Column("<i8")] = b""
+    """count of the second sheet's channel, 0 of pads without one; empty for a hand without any"""
 
 
 class UsedJoints(TypedDict):

@@ -1,8 +1,8 @@
 """Status codes: numbers in columns, lower-case names in other messages (`status.text`).
 
-Public names: `MAX_SILENT_PERIODS`, `StatusCode`, `PadState`, `PositionStatus`, `ForceStatus`, `FrameStatus`,
-and the type of the names of each, `PadStateName` and so on. A later version may add codes.
-"""
+Public names: `MAX_SILENT_PERIODS`, `StatusCode`, `PadState`, `PositionStatus`, `ForceStatus`,
+`ContactRadiusStatus`, `FrameStatus`, and the type of the names of each, `PadStateName` and so on. A later
+version may add codes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any, Literal
 PadStateName = Literal["clear", "touched", "stale", "lost", "faulted", "starting", "off"]
 PositionStatusName = Literal["not_computed", "valid", "unreliable", "invalid"]
 ForceStatusName = Literal["not_computed", "valid", "lower_bound", "unreliable", "invalid"]
+ContactRadiusStatusName = Literal["not_computed", "valid", "assumed", "contradictory"]
 FrameStatusName = Literal["not_computed", "valid", "stale", "invalid"]
 
 
@@ -85,6 +86,20 @@ class ForceStatus(StatusCode):
     UNRELIABLE = 3
     """the pad's baseline, or the state of its sheet, is not known well enough yet"""
     INVALID = 4
+
+
+class ContactRadiusStatus(StatusCode):
+    """Status of a contact's radius."""
+
+    NOT_COMPUTED = 0
+    """no scene requests forces, or no contact"""
+    VALID = 1
+    """estimated from the currents of two sheets"""
+    ASSUMED = 2
+    """of the sheet's table: its range of radii, which the currents don't narrow"""
+    CONTRADICTORY = 3
+    """the two sheets contradict each other at any such radius: it is assumed, and `force_n` is by the
+    first"""
 
 
 class FrameStatus(StatusCode):

@@ -11,6 +11,7 @@ enum class PadState : std::uint8_t { clear, touched, stale, lost, faulted, start
 enum class PositionStatus : std::uint8_t { not_computed, valid, unreliable, invalid };
 enum class ForceStatus : std::uint8_t { not_computed, valid, lower_bound, unreliable, invalid };
 enum class FrameStatus : std::uint8_t { not_computed, valid, stale, invalid };
+enum class ContactRadiusStatus : std::uint8_t { not_computed, valid, assumed, contradictory };
 
 // One of two contacts on a pad at once; the statuses of its places are those of the contact.
 struct ContactPart {
@@ -134,6 +135,29 @@ struct Contact {
     // part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
     // the pad, so that the difference of two positions has the rest
     std::optional<Vector<9>> mount_covariance_m2;
+    // status of the two that follow
+    std::string contact_radius_status = "not_computed";
+    // radius of the contact, of a disc as large: estimated with the force on a pad with two sheets, else that
+    // which `force_n` is for
+    std::optional<double> contact_radius_m;
+    // standard deviation of `contact_radius_m`
+    std::optional<double> contact_radius_std_m;
+    // length of the line that is as elongated: 0 of a round contact, of a rectangle the root of the
+    // difference of its sides' squares. On a pad of four electrodes that of the shortest line that explains
+    // the currents, along `length_axis`; this and the four that follow are absent where they aren't known, as
+    // with `parts`
+    std::optional<double> length_m;
+    // lower end of the interval of 95 % of `length_m`
+    std::optional<double> min_length_m;
+    // upper end of that interval; absent on a pad of four electrodes, which show one combination of length
+    // and direction
+    std::optional<double> max_length_m;
+    // unit vector along the contact, of either sign, in the link's frame; absent if the currents are those of
+    // a round one
+    std::optional<Vector<3>> length_axis;
+    // standard deviation of its direction in the pad's plane; 0.45 on a pad of four electrodes: within 45
+    // degrees
+    std::optional<double> length_axis_std_rad;
 };
 
 template <class Message, class Visit>
@@ -186,6 +210,14 @@ void each_field_of_contact(Message& message, Visit&& visit) {
     visit("base_force_vector_n", message.base_force_vector_n, true);
     visit("parts", message.parts, true);
     visit("mount_covariance_m2", message.mount_covariance_m2, true);
+    visit("contact_radius_status", message.contact_radius_status, true);
+    visit("contact_radius_m", message.contact_radius_m, true);
+    visit("contact_radius_std_m", message.contact_radius_std_m, true);
+    visit("length_m", message.length_m, true);
+    visit("min_length_m", message.min_length_m, true);
+    visit("max_length_m", message.max_length_m, true);
+    visit("length_axis", message.length_axis, true);
+    visit("length_axis_std_rad", message.length_axis_std_rad, true);
 }
 
 // Columns of `hand/<hand>`; empty where no scene requests them.
@@ -255,6 +287,22 @@ struct FrameColumns {
     // part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all contacts of
     // the pad, so that the difference of two positions has the rest
     Column<float, 9> mount_covariance_m2;
+    // status of the contact's radius
+    Column<std::uint8_t> contact_radius_status;
+    // radius of the contact
+    Column<float> contact_radius_m;
+    // its standard deviation
+    Column<float> contact_radius_std_m;
+    // length of the line that is as elongated; NaN where nothing is known of it
+    Column<float> length_m;
+    // lower end of its interval of 95 %
+    Column<float> min_length_m;
+    // upper end of its interval of 95 %
+    Column<float> max_length_m;
+    // unit vector along it, in the link's frame
+    Column<float, 3> length_axis;
+    // standard deviation of its direction
+    Column<float> length_axis_std_rad;
 };
 
 template <class Message, class Visit>
@@ -289,6 +337,14 @@ void each_field_of_frame_columns(Message& message, Visit&& visit) {
     visit("palm_force_vector_n", message.palm_force_vector_n, true);
     visit("base_force_vector_n", message.base_force_vector_n, true);
     visit("mount_covariance_m2", message.mount_covariance_m2, true);
+    visit("contact_radius_status", message.contact_radius_status, true);
+    visit("contact_radius_m", message.contact_radius_m, true);
+    visit("contact_radius_std_m", message.contact_radius_std_m, true);
+    visit("length_m", message.length_m, true);
+    visit("min_length_m", message.min_length_m, true);
+    visit("max_length_m", message.max_length_m, true);
+    visit("length_axis", message.length_axis, true);
+    visit("length_axis_std_rad", message.length_axis_std_rad, true);
 }
 
 }  // namespace handtouch

@@ -75,6 +75,14 @@ class RosContact(IdlStruct, typename="handtouch_msgs::msg::dds_::Contact_"):
     palm_force_vector_n: Vector3
     base_force_vector_n: Vector3
     mount_covariance_m2: Annotated[Sequence[float64], array(float64, 9)]
+    contact_radius_status: uint8
+    contact_radius_m: float64
+    contact_radius_std_m: float64
+    length_m: float64
+    min_length_m: float64
+    max_length_m: float64
+    length_axis: Vector3
+    length_axis_std_rad: float64
     parts: Annotated[Sequence[RosContactPart], sequence(RosContactPart)]
 
 

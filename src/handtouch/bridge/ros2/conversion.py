@@ -20,7 +20,7 @@ from handtouch import wire
 from handtouch.bridge.ros2 import messages as ros
 from handtouch.bridge.ros2.cdr import ENCAPSULATION, Layout
 from handtouch.bridge.ros2.contact_messages import ContactArray, RosContact, RosContactPart
-from handtouch.wire import ForceStatus, FrameStatus, PositionStatus, StatusCode
+from handtouch.wire import ContactRadiusStatus, ForceStatus, FrameStatus, PositionStatus, StatusCode
 from handtouch.wire.declarations import declared_fields
 
 _CONTACTS, _CONTACT, _WRENCH = Layout(ContactArray), Layout(RosContact), Layout(ros.WrenchStamped)
@@ -29,6 +29,7 @@ _EVENTS = {event: number for number, event in enumerate(typing.get_args(wire.Con
 _LATER: dict[type[StatusCode], int] = {
     PositionStatus: PositionStatus.UNRELIABLE,
     ForceStatus: ForceStatus.UNRELIABLE,
+    ContactRadiusStatus: ContactRadiusStatus.ASSUMED,
     FrameStatus: FrameStatus.NOT_COMPUTED,
 }
 """Codes for a status that a later version added: such values may not be relied on."""
@@ -140,17 +141,15 @@ _CONTACT_FIELDS, _PART_FIELDS = (
 """Field of the wire, and its conversion, of each field of a ROS message behind header and event."""
 
 
-def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes:
+def encode_wrench(contact: wire.Contact, stamper: Stamper) -> bytes | None:
     """Return the encoded `ros.WrenchStamped` on the link, about its frame's origin: zero once it is released,
-    NaN where force or position is unknown or the contact has no new sample."""
+    None where force or position is unknown or the contact has no new sample."""
     if contact.event == "end":
         is_released = contact.end_reason == "released"
-        return encode_plain_wrench(contact.t_ns, contact.frame, 0.0 if is_released else math.nan, stamper)
-    wrench = None
-    if contact.fresh:
-        whole = contact.force_vector_n if contact.force_vector_status == "valid" else None
-        wrench = _wrench(contact.position_m, contact.normal, contact.force_n, whole)
-    return _encode_wrench(contact.t_ns, contact.frame, wrench or (math.nan,) * 6, stamper)
+        return encode_plain_wrench(contact.t_ns, contact.frame, 0.0, stamper) if is_released else None
+    whole = contact.force_vector_n if contact.force_vector_status == "valid" else None
+    wrench = _wrench(contact.position_m, contact.normal, contact.force_n, whole) if contact.fresh else None
+    return _encode_wrench(contact.t_ns, contact.frame, wrench, stamper) if wrench else None
 
 
 def encode_sum(contacts: Iterable[wire.Contact], t_ns: int, palm_link: str, stamper: Stamper) -> bytes | None:
@@ -199,7 +198,10 @@ def contact_markers(contact: wire.Contact, number: int, stamper: Stamper) -> lis
     markers = [
         ros.Marker(header, "contact", number, _SPHERE, pose=ros.Pose(at), scale=size, color=color),
         ros.Marker(
-            *(header, "force", number, _ARROW),
+            header,
+            "force",
+            number,
+            _ARROW,
             scale=ros.Vector3(_SHAFT_M, _HEAD_M, 0.0),
             color=color,
             points=[ros.Point(*(position + length_m * normal).tolist()), at],
@@ -247,8 +249,19 @@ def pad_status(health: wire.Health) -> ros.DiagnosticStatus:
     values = {
         name: getattr(health, name)
         for name in (
-            *("state", "node_state", "bus", "node_id", "sampling", "rate_hz", "samples", "missed_samples"),
-            *("age_s", "reboots", "heartbeats_missed", "error_register", "calibration_state"),
+            "state",
+            "node_state",
+            "bus",
+            "node_id",
+            "sampling",
+            "rate_hz",
+            "samples",
+            "missed_samples",
+            "age_s",
+            "reboots",
+            "heartbeats_missed",
+            "error_register",
+            "calibration_state",
             "calibration_id",
         )
     }

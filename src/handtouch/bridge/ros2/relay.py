@@ -118,10 +118,9 @@ class RosRelay:
             self._session, self._newest_ns, self._sent_ns = service.session, 0, 0
             self._dropped_inputs = 0
             self._statuses.clear()
-            for known in self._hands.values():
-                known.forget_losses()
             _log.info("daemon %s connected, hands: %s", service.version, ", ".join(service.hands))
         for hand in service.hands:
+            self._hand(hand).begin_session(service.session)
             self._hand(hand).links = tuple(service.hands[hand])
             self._hand(hand).longest_silence_s = age_limit_s(service.frame_period_s or service.period_s)
         self._update_status(conversion.daemon_status(service))
@@ -191,8 +190,9 @@ class RosRelay:
 class _HandRelay:
     """Topics of one hand.
 
-    A wrench of zero is published for a pad that is sampled and not touched, one of NaN, stamped with its last
-    sample, when it isn't sampled any more, and then none until it is.
+    A wrench of zero is published for a pad that is sampled and not touched; one of NaN for a sample without a
+    force, and, stamped with the last sample, when the pad isn't sampled any more. Then there is none until it
+    is: there are never two of NaN for a sample.
     """
 
     def __init__(self, name: str, palm_link: str, network: RosNetwork, stamper: Stamper) -> None:
@@ -206,8 +206,10 @@ class _HandRelay:
         self._object: RosWriter | None = None
         self._tick_contacts: list[wire.Contact] = []
         self._active: dict[str, wire.Contact] = {}
-        self._known_ns: dict[str, int] = {}  # links whose last wrench isn't NaN -> time of its sample
-        self._lost_ns: dict[str, int] = {}  # links whose wrench was NaN -> newest sample, unknown by now
+        self._session: int | None = None
+        self._known_ns: dict[str, int] = {}  # sampled links -> time of the sample
+        self._lost_ns: dict[str, int] = {}  # links that were lost -> newest sample, unknown by now
+        self._nan_ns: dict[str, int] = {}  # links -> time of their last wrench of NaN
         self._sum_ns: int | None = None  # time of the sum, None once it is unknown
         self._shown: dict[str, tuple[wire.Contact, bool]] = {}  # link with markers -> its contact, unknown
         self._unknown: dict[str, wire.Contact] = {}  # contacts that were lost sight of
@@ -231,8 +233,11 @@ class _HandRelay:
             return
         self._unknown.pop(link, None)
         self._known_ns[link] = contact.t_ns
-        if (writer := self._writer_of(link)).is_read:
-            writer.write(conversion.encode_wrench(contact, self._stamper))
+        wrench = conversion.encode_wrench(contact, self._stamper)
+        if wrench is None:
+            self._write_nan(link, contact.frame, contact.t_ns)
+        elif (writer := self._writer_of(link)).is_read:
+            writer.write(wrench)
 
     def end_tick(self, frame: wire.HandFrame, received_s: float) -> None:
         """Publish the contacts of the tick whose frame this is, which follows them."""
@@ -252,13 +257,10 @@ class _HandRelay:
     def send_object(self, percept: wire.Percept) -> None:
         """Publish the pose of the object in the hand while it is determined."""
         if percept.kind == "object" and percept.state == "estimated" and percept.poses and self._palm_link:
-            writer = (
-                self._network.writer(f"{self._root}/object", ros.PoseWithCovarianceStamped, Quality.STREAM)
-                if self._object is None
-                else self._object
-            )
-            self._object = writer
-            writer.write(conversion.object_pose(percept, self._palm_link, self._stamper))
+            if self._object is None:
+                topic = f"{self._root}/object"
+                self._object = self._network.writer(topic, ros.PoseWithCovarianceStamped, Quality.STREAM)
+            self._object.write(conversion.object_pose(percept, self._palm_link, self._stamper))
 
     def _update_pads(self, frame: wire.HandFrame) -> dict[str, int] | None:
         """Publish what the frame says of pads; return ids of contacts by link, None if one isn't sampled."""
@@ -287,9 +289,12 @@ class _HandRelay:
         """Return True if there was no frame for `longest_silence_s`."""
         return self._received_s is not None and now_s - self._received_s > self.longest_silence_s
 
-    def forget_losses(self) -> None:
-        """Begin another session, whose clock may be another."""
-        self._lost_ns.clear()
+    def begin_session(self, session: int) -> None:
+        """Note the daemon's session: the clock of another one may be another."""
+        if session != self._session:
+            self._session = session
+            self._lost_ns.clear()
+            self._nan_ns.clear()
 
     def lose_all(self) -> None:
         """Publish that everything is unknown: the daemon is disconnected or silent."""
@@ -309,7 +314,13 @@ class _HandRelay:
             return
         self._lost_ns[link] = t_ns = max(known_ns, t_ns)  # what is unknown stays so until a newer sample
         frame = contact.frame if (contact := self._unknown.get(link)) else link
-        self._writer_of(link).write(conversion.encode_plain_wrench(t_ns, frame, math.nan, self._stamper))
+        self._write_nan(link, frame, t_ns)
+
+    def _write_nan(self, link: str, frame: str, t_ns: int) -> None:
+        """Publish that the wrench of a sample is unknown, unless it was published before."""
+        if t_ns > self._nan_ns.get(link, -1):
+            self._nan_ns[link] = t_ns
+            self._writer_of(link).write(conversion.encode_plain_wrench(t_ns, frame, math.nan, self._stamper))
 
     def _lose_sum(self) -> None:
         if self._sum_ns is not None and self._palm_link:

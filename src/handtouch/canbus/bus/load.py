@@ -21,16 +21,18 @@ def frame_bits(data_bytes: int) -> int:
     return 47 + 8 * data_bytes + (33 + 8 * data_bytes) // 4
 
 
-def bus_load(bit_rate: float, pads: int, sync_period_s: float, heartbeat_s: float) -> float:
+def bus_load(
+    bit_rate: float, pads: int, sync_period_s: float, heartbeat_s: float, further_bits: int = 0
+) -> float:
     """Return the bus load of SYNC, one sample of each pad per SYNC and the nodes' heartbeats (1: full).
 
-    `bit_rate` in bit/s. Start-up (some 30 SDO frames per node) and other traffic add to it.
-    """
-    cycle = frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES)
+    `bit_rate` in bit/s. further_bits: of second and later TPDOs, in each cycle. Start-up (some 30 SDO frames
+    per node) and other traffic add to it."""
+    cycle = frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES) + further_bits
     heartbeats = pads * frame_bits(HEARTBEAT_DATA_BYTES)
     return (cycle / sync_period_s + heartbeats / heartbeat_s) / bit_rate
 
 
-def burst_s(bit_rate: float, pads: int) -> float:
+def burst_s(bit_rate: float, pads: int, further_bits: int = 0) -> float:
     """Return the seconds from the start of SYNC to the end of the last sample, without other traffic."""
-    return (frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES)) / bit_rate
+    return (frame_bits(0) + pads * frame_bits(SAMPLE_DATA_BYTES) + further_bits) / bit_rate

@@ -1,5 +1,6 @@
 cimport cython
 from handtouch.core.stages.receive cimport SampleMemory
+from handtouch.core.stages.rows cimport TouchRow
 
 cdef Py_ssize_t _VALUES, _CLEAR, _TOUCHED, _STALE, _FAULTED, _STARTING, _MAX_SILENT
 cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _MAX_NEGATIVE_AMPLITUDES, _MAX_ZERO_FRACTION, _NAN
@@ -7,10 +8,11 @@ cdef double _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION, _MAX_NEGATIVE_AMPLITUDE
 cdef class ContactDetection:
     cdef Py_ssize_t pads, channels
     cdef readonly Py_ssize_t began, ended, updated, silent, solved, framed
-    cdef long long[::1] rows
+    cdef long long[::1] began_pads, ended_pads, updated_pads, silent_pads, solved_pads, framed_pads
+    cdef TouchRow[:] touch
     cdef double[::1] expected_counts, currents, ampere_per_count, noise_counts
     cdef double[::1] begin_threshold_a, end_threshold_a, mean_ampere_per_count, offset_std, offset_std_a
-    cdef long long[::1] begin_debounce_ns, end_debounce_ns, max_gap_periods
+    cdef long long[::1] sample_delay_ns
     cdef long long[::1] ticks, sample_ns, arrival_ns, sample_counts, missed_sample_counts, silent_ns
     cdef long long[::1] max_sample_period_ns
     cdef unsigned char[::1] pad_state, synchronous, touching, is_solved, position_requested, held
@@ -40,7 +42,7 @@ cdef bint _sources(ContactDetection stage, Py_ssize_t pad, double total, double 
 @cython.locals(period_ns='long long')
 cdef void _check_silence(
     ContactDetection stage, Py_ssize_t pad, long long cycle_ns, long long half_period_ns) noexcept
-@cython.locals(level=double, touching=bint, above=bint, debounce_ns='long long', elapsed_ns='long long')
+@cython.locals(level=double, touching=bint, above=bint, debounce_ns=double, elapsed_ns='long long')
 cdef void _detect_contact(ContactDetection stage, Py_ssize_t pad, long long half_period_ns) noexcept
 @cython.locals(factor=double, begin_a=double, end_a=double)
 cdef bint _is_above(ContactDetection stage, Py_ssize_t pad, double level, bint touching) noexcept

@@ -5,7 +5,7 @@ Public name: `ContactDetection`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from handtouch.core.stages.receive import SampleMemory
@@ -25,20 +25,22 @@ class ContactDetection:
     """Detection of contacts on n pads, at most one each.
 
     arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n c),
-    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,),
-    begin_debounce_ns, end_debounce_ns and max_gap_periods (n,); expected_counts (n c) of untouched pads.
+    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), sample_delay_ns
+    (n,) and touch, (n,) TOUCH_ROWs; expected_counts (n c) of untouched pads.
     Written for the solver: currents (n c,), saturated (n c,), 1 for a channel at the top of its range, and
     offset_std_a (n,), the standard deviation of the sums of the currents from the baseline [A].
     c is the number of electrodes of the pad that has most; those that a pad lacks have no current. Further
     channels of the slab are those of shear pads, whose currents never end: they are no part of a contact.
 
-    rows: (6 n,): pads whose contact began, ended, has a new sample and didn't begin, misses one, is to be
+    lists: (n,) each, pads whose contact began, ended, has a new sample and didn't begin, misses one, is to be
     solved, or has a new sample that only a hand frame needs; `began`, `ended`, `updated`, `silent`, `solved`
-    and `framed` of them, n from one list to the next.
+    and `framed` of them.
     """
 
-    def __init__(self, pads: int, arrays: Mapping[str, Any], rows: memoryview[int]) -> None:
-        self.pads, self.rows = pads, rows
+    def __init__(self, pads: int, arrays: Mapping[str, Any], lists: Sequence[memoryview[int]]) -> None:
+        self.pads = pads
+        self.began_pads, self.ended_pads, self.updated_pads = lists[:3]
+        self.silent_pads, self.solved_pads, self.framed_pads = lists[3:]
         self.began = self.ended = self.updated = self.silent = self.solved = self.framed = 0
         # model
         self.expected_counts, self.currents = arrays["expected_counts"], arrays["currents"]
@@ -49,8 +51,7 @@ class ContactDetection:
         self.offset_std, self.offset_std_a = arrays["offset_std"], arrays["offset_std_a"]
         self.begin_threshold_a = arrays["begin_threshold_a"]
         self.end_threshold_a = arrays["end_threshold_a"]
-        self.begin_debounce_ns, self.end_debounce_ns = arrays["begin_debounce_ns"], arrays["end_debounce_ns"]
-        self.max_gap_periods = arrays["max_gap_periods"]
+        self.touch, self.sample_delay_ns = arrays["touch"], arrays["sample_delay_ns"]
         # samples
         self.ticks = arrays["ticks"]
         self.pad_state, self.sample_ns = arrays["pad_state"], arrays["sample_ns"]
@@ -109,7 +110,7 @@ class ContactDetection:
                 self.pad_state[pad] = _FAULTED
             elif self.touching[pad]:
                 self.pad_state[pad] = _TOUCHED
-            elif self.zeroing:
+            elif self.zeroing and self.known[pad] == 0:
                 self.pad_state[pad] = _STARTING
             elif self.pad_state[pad] <= _TOUCHED or self.contradicting_samples[pad] == 0:
                 self.pad_state[pad] = _CLEAR
@@ -128,7 +129,8 @@ def _take_sample(
     previous_sync_ns: int,
     until_ns: int,
 ) -> None:
-    """Note a pad's new sample and its time: its SYNC, or its arrival where it is event-driven."""
+    """Note a pad's new sample and its time: its SYNC, or its arrival where it is event-driven, less the delay
+    of a node that samples by itself."""
     arrival_ns = memory.arrival_ns[pad]
     here = arrival_ns < until_ns
     stage.sampled = here and operational and arrival_ns != stage.arrival_ns[pad]
@@ -139,6 +141,7 @@ def _take_sample(
         stage.sample_ns[pad] = sync_ns if in_time else previous_sync_ns
         if not stage.synchronous[pad]:
             stage.sample_ns[pad] = arrival_ns
+        stage.sample_ns[pad] -= stage.sample_delay_ns[pad]
     watched = stage.pad_state[pad] <= _TOUCHED or stage.contradicting_samples[pad] > 0
     if not in_time and operational and stage.synchronous[pad] and watched:
         stage.missed_sample_counts[pad] += 1
@@ -178,7 +181,7 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
     stage.railed, stage.zeroing = railed, False
     stage.implausible = railed
     if not railed and _sources(stage, pad, total, magnitude):
-        stage.zeroing = near_zero and stage.known[pad] == 0 and stage.touching[pad] == 0
+        stage.zeroing = near_zero and (stage.known[pad] == 0 or stage.held[pad] != 0)
         stage.implausible = not stage.zeroing
     stage.trusted = not stage.implausible
     if stage.sampled:
@@ -211,7 +214,7 @@ def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period
     stage.silent_ns[pad] += max(0, min(cycle_ns, period_ns))
     # times of SYNCs vary
     stage.stale = stage.silent_ns[pad] > _MAX_SILENT * period_ns - half_period_ns
-    if stage.silent_ns[pad] > stage.max_gap_periods[pad] * period_ns + half_period_ns:
+    if stage.silent_ns[pad] > stage.touch[pad].max_gap_periods * period_ns + half_period_ns:
         stage.trusted = False
 
 
@@ -228,7 +231,7 @@ def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> N
         if stage.contradicting_samples[pad] == 0:
             stage.first_sample_ns[pad] = stage.sample_ns[pad]
         stage.contradicting_samples[pad] += 1
-        debounce_ns = stage.end_debounce_ns[pad] if touching else stage.begin_debounce_ns[pad]
+        debounce_ns = 1e6 * (stage.touch[pad].end_ms if touching else stage.touch[pad].begin_ms)
         elapsed_ns = stage.sample_ns[pad] - stage.first_sample_ns[pad]
         if stage.contradicting_samples[pad] > 1:
             elapsed_ns += half_period_ns
@@ -265,13 +268,13 @@ def _begin_contact(stage: ContactDetection, pad: int) -> None:
     for i in range(pad * stage.channels, (pad + 1) * stage.channels):
         stage.block_sum[i] = stage.block_squares[i] = 0.0
     stage.block_count[pad] = 0.0
-    stage.rows[stage.began] = pad
+    stage.began_pads[stage.began] = pad
     stage.began += 1
 
 
 def _end_contact(stage: ContactDetection, pad: int) -> None:
     stage.touching[pad] = stage.contradicting_samples[pad] = 0
-    stage.rows[stage.pads + stage.ended] = pad
+    stage.ended_pads[stage.ended] = pad
     stage.ended += 1
 
 
@@ -285,18 +288,18 @@ def _select(stage: ContactDetection, pad: int, continued: bool, above: bool) -> 
     framed = stage.ticks[0] % stage.ticks_per_hand_frame[0] == 0
     if not stage.sampled:
         if due and stage.synchronous[pad]:
-            stage.rows[3 * stage.pads + stage.silent] = pad
+            stage.silent_pads[stage.silent] = pad
             stage.silent += 1
     elif above and (due or framed or not continued):
         if continued and due:
-            stage.rows[2 * stage.pads + stage.updated] = pad
+            stage.updated_pads[stage.updated] = pad
             stage.updated += 1
         elif continued:
-            stage.rows[5 * stage.pads + stage.framed] = pad
+            stage.framed_pads[stage.framed] = pad
             stage.framed += 1
         if stage.position_requested[pad]:
             stage.offset_std_a[pad] = stage.offset_std[pad] * stage.mean_ampere_per_count[pad]
-            stage.rows[4 * stage.pads + stage.solved] = pad
+            stage.solved_pads[stage.solved] = pad
             stage.solved += 1
 
 

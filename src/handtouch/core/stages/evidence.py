@@ -3,31 +3,53 @@
 Contacts on one rigid object slip together, and each shows it in its own way, so the odds of a contact include
 the evidence of the hand's other contacts.
 
-Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`, `EVIDENCE_WORK`,
+Public names: `EvidenceStage`, `SLIP_FEATURES`, `EVIDENCE_WINDOWS_S`, `EVIDENCE_FIELDS`,
 `ALONE_LOG_ODDS`, `OTHERS_WEIGHT`, `MAX_OTHERS_LOG_ODDS`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from handtouch.core.stages.slip import SLIP_COUNT, SLIP_SLICES
+import numpy as np
+
+from handtouch.core.memory import RowArray, row_count, view_memory, view_rows
 
 _WINDOW_MS = (10, 20, 50, 100)
 _LINK_WINDOW_MS = (20, 50, 100)  # shorter ones show the noise of encoders alone
 _HAND_WINDOW_MS = (50, 100)
-SLIP_FEATURES = (
-    "log_ratio", "slipping", "slip_mm_per_s", "onset_age_s", "relative_force_rate_per_s",
-    *(f"log_current_change_{ms}ms" for ms in _WINDOW_MS),
-    *(f"moved_mm_{ms}ms" for ms in _WINDOW_MS),
-    *(f"turned_rad_{ms}ms" for ms in _LINK_WINDOW_MS),
-    *(f"link_moved_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
-    *(f"relative_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
-    *(f"relative_std_mm_{ms}ms" for ms in _LINK_WINDOW_MS),
-    *(f"hand_turned_rad_{ms}ms" for ms in _HAND_WINDOW_MS),
-    "others_slipping", "others_log_ratio", "others_current_change_20ms",
-    "step_mm_100ms", "straightness_100ms", "explained_by_current_100ms", "palm_moved_mm_100ms",
-)  # fmt: skip
+FEATURE_ROW = np.dtype(
+    [
+        ("log_ratio", "<f8"),
+        ("slipping", "<f8"),
+        ("slip_mm_per_s", "<f8"),
+        ("onset_age_s", "<f8"),
+        ("relative_force_rate_per_s", "<f8"),
+        ("log_current_change", "<f8", len(_WINDOW_MS)),
+        ("moved_mm", "<f8", len(_WINDOW_MS)),
+        ("turned_rad", "<f8", len(_LINK_WINDOW_MS)),
+        ("link_moved_mm", "<f8", len(_LINK_WINDOW_MS)),
+        ("relative_mm", "<f8", len(_LINK_WINDOW_MS)),
+        ("relative_std_mm", "<f8", len(_LINK_WINDOW_MS)),
+        ("hand_turned_rad", "<f8", len(_HAND_WINDOW_MS)),
+        ("others_slipping", "<f8"),
+        ("others_log_ratio", "<f8"),
+        ("others_current_change_20ms", "<f8"),
+        ("step_mm_100ms", "<f8"),
+        ("straightness_100ms", "<f8"),
+        ("explained_by_current_100ms", "<f8"),
+        ("palm_moved_mm_100ms", "<f8"),
+    ]
+)
+"""Features of a contact, those over windows from the shortest to the longest"""
+_WINDOWS_MS = {len(windows): windows for windows in (_WINDOW_MS, _LINK_WINDOW_MS, _HAND_WINDOW_MS)}
+SLIP_FEATURES = tuple(
+    f"{name}_{ms}ms" if ms else name
+    for name in FEATURE_ROW.names or ()
+    for ms in _WINDOWS_MS.get(row_count(FEATURE_ROW[name]), (0,))
+)
 """Names of features; each is NaN where a contact or its link's pose hasn't been known for long enough.
 
 log_ratio to relative_force_rate: of the slip stage. Over windows: change of ln of the total current; way of
@@ -43,41 +65,24 @@ the pad moves the centroid in a step, as the current changes, while no other con
 EVIDENCE_WINDOWS_S = tuple(1e-3 * ms for ms in _WINDOW_MS)
 """Windows [s] of features."""
 EVIDENCE_FIELDS = (
-    "pad_m", "total_current_a", "position_m", "palm_position_m", "palm_normal", "palm_rotation",
+    "pad_m",
+    "total_current_a",
+    "position_m",
+    "palm_position_m",
+    "palm_normal",
+    "palm_rotation",
     "palm_joints_m2",
-)  # fmt: skip
-"""Fields of samples that features are computed from, in the order of `EvidenceStage.offsets`."""
+)
+"""Fields of samples that features are computed from"""
 
 ALONE_LOG_ODDS = 1.5
 """Added to ln of the odds of a hand's only contact: nothing else holds the object there."""
 OTHERS_WEIGHT, MAX_OTHERS_LOG_ODDS = 0.8, 4.0
 """Weight of the mean of the trees' sums of a hand's other contacts, limited to +-MAX_OTHERS_LOG_ODDS."""
 
-_COUNT, _WINDOWS, _LINK_WINDOWS, _HAND_WINDOWS = len(SLIP_FEATURES), 4, 3, 2
-_LOG_RATIO, _SLIPPING, _SPEED, _ONSET_AGE, _FORCE_RATE = 0, 1, 2, 3, 4
-_CURRENT_CHANGE = 5
-_MOVED = _CURRENT_CHANGE + _WINDOWS
-_TURNED = _MOVED + _WINDOWS
-_LINK_MOVED = _TURNED + _LINK_WINDOWS
-_RELATIVE = _LINK_MOVED + _LINK_WINDOWS
-_RELATIVE_STD = _RELATIVE + _LINK_WINDOWS
-_HAND_TURNED = _RELATIVE_STD + _LINK_WINDOWS
-_OTHERS_SLIPPING = _HAND_TURNED + _HAND_WINDOWS
-_OTHERS_RATIO, _OTHERS_CHANGE, _STEP = _OTHERS_SLIPPING + 1, _OTHERS_SLIPPING + 2, _OTHERS_SLIPPING + 3
-_STRAIGHTNESS, _EXPLAINED, _PALM_MOVED = _OTHERS_SLIPPING + 4, _OTHERS_SLIPPING + 5, _OTHERS_SLIPPING + 6
+_COUNT, _WINDOWS = len(SLIP_FEATURES), len(_WINDOW_MS)
+_LINK_WINDOWS, _HAND_WINDOWS = len(_LINK_WINDOW_MS), len(_HAND_WINDOW_MS)
 _OTHERS_WINDOW, _PATH_WINDOW, _PATH_STEPS = 1, 3, 20
-_PAD_M, _CURRENT, _POSITION, _PALM_POSITION, _NORMAL, _ROTATION, _JOINTS_M2 = 0, 1, 2, 3, 4, 5, 6
-
-_SLIP_ROW = SLIP_COUNT
-_ROW_LOG_RATIO, _ROW_SLIPPING, _ROW_ONSET_AGE, _ROW_FORCE, _ROW_RATE, _ROW_VELOCITY, _ROW_LOG_ODDS = (
-    SLIP_SLICES["log_ratio"].start,
-    SLIP_SLICES["slipping"].start,
-    SLIP_SLICES["onset_age_s"].start,
-    SLIP_SLICES["force_n"].start,
-    SLIP_SLICES["force_rate_n_per_s"].start,
-    SLIP_SLICES["slip_velocity_m_per_s"].start,
-    SLIP_SLICES["log_odds"].start,
-)
 _MAX_LOG_RATIO = 60.0
 _MIN_LOG_RATIO = -20.0
 _MIN_FORCE_N = 0.05
@@ -95,59 +100,69 @@ _MIN_PIVOT = 1e-6  # information is that of the prior at least, 1e3 and more
 _NAN, _INFINITY = float("nan"), float("inf")
 
 _MOTION = 6  # velocity and rotation of a rigid body
-_INFORMATION, _WEIGHTED, _FACTOR, _BODY, _POINT, _OFF = 0, 36, 42, 78, 84, 102
-EVIDENCE_WORK = 105
+BODY_ROW = np.dtype(
+    [
+        ("information", "<f8", (_MOTION, _MOTION)),
+        ("weighted", "<f8", _MOTION),  # ways of its points
+        ("factor", "<f8", (_MOTION, _MOTION)),  # of the information: lower triangle
+        ("motion", "<f8", _MOTION),  # L^-1 of the weighted ways
+        ("point", "<f8", (3, _MOTION)),  # way of one point per motion
+        ("off", "<f8", 3),  # way of that point off the body
+    ]
+)
+"""A rigid body on the contacts of a hand"""
 
 
 class EvidenceStage:
-    """Evidence of slip of the contacts of n pads; arrays are flat, with a row a pad.
+    """Evidence of slip of the contacts of n pads.
 
-    history: (n 2 length width,), sample_ns: (n 2 length,) and sample_count: (n,), those of a `ContactBuffer`;
-    offsets: (7,) of EVIDENCE_FIELDS in a sample. steps: (4,) samples in each of the `windows` (4,) [s].
-    hands: (n,) number of each pad's hand. slip: (n SLIP_COUNT,) of the slip stage. tested, thresholds: (t d,)
-    features and thresholds of t trees of d levels; leaves: (t 2^d,).
+    offsets: of EVIDENCE_FIELDS in a sample, by name. steps: samples in each of the windows. hands: (n,)
+    number of each pad's hand. slip: (n,) SLIP_ROWs of the slip stage.
 
-    Results: features (n SLIP_FEATURES,); log_odds (n,) of slip, NaN where unknown, and the times
-    evidence_ns (n,) of the last update; velocities (n 3,) [m/s] of links at contacts in the palm, with the
-    deviation of a component in velocity_std (n,), NaN where unknown. own_odds: (n,), the trees' sums of the
-    last update. ways: (n 3,), due: (n,), work: (EVIDENCE_WORK,), working memory.
+    arrays: memory by name. Those of a `ContactBuffer` are values (n 2 length width,), sample_ns (n 2 length,)
+    and sample_count (n,). Of t trees of d levels tested, thresholds (t d,) are features and thresholds,
+    leaves (t 2^d,). Results: features (n SLIP_FEATURES,); log_odds (n,) of slip, NaN where unknown, and the
+    times evidence_ns (n,) of the last update.
+
+    Results besides: velocities (n 3,) [m/s] of links at contacts in the palm, with the deviation of a
+    component in velocity_std (n,), NaN where unknown; own_odds (n,), the trees' sums of the last update.
     """
 
     def __init__(
         self,
-        history: memoryview[float],
-        sample_ns: memoryview[int],
-        sample_count: memoryview[int],
-        length: int,
+        arrays: Mapping[str, Any],
+        offsets: Mapping[str, int],
+        steps: Sequence[int],
         width: int,
-        offsets: memoryview[int],
-        steps: memoryview[int],
-        windows: memoryview[float],
-        hands: memoryview[int],
-        slip: memoryview[float],
-        tested: memoryview[int],
-        thresholds: memoryview[float],
-        leaves: memoryview[float],
         levels: int,
-        features: memoryview[float],
-        log_odds: memoryview[float],
-        evidence_ns: memoryview[int],
-        velocities: memoryview[float],
-        velocity_std: memoryview[float],
-        own_odds: memoryview[float],
-        ways: memoryview[float],
-        due: memoryview[int],
-        work: memoryview[float],
+        hands: memoryview[int],
+        slip: RowArray,
     ) -> None:
-        self.history, self.sample_ns, self.sample_count = history, sample_ns, sample_count
-        self.length, self.width = length, width
-        self.offsets, self.steps, self.windows = offsets, steps, windows
+        n = len(hands)
+        self.history: memoryview[float] = arrays["values"]
+        self.sample_ns: memoryview[int] = arrays["sample_ns"]
+        self.sample_count: memoryview[int] = arrays["sample_count"]
+        self.width = width
+        self.length = len(self.sample_ns) // (2 * n)
+        self.pad_m, self.total_current_a = offsets["pad_m"], offsets["total_current_a"]
+        self.position_m, self.palm_position_m = offsets["position_m"], offsets["palm_position_m"]
+        self.palm_normal, self.palm_rotation = offsets["palm_normal"], offsets["palm_rotation"]
+        self.palm_joints_m2 = offsets["palm_joints_m2"]
+        self.steps = view_memory(np.array(steps, np.intp))
+        self.windows = view_memory(np.array(EVIDENCE_WINDOWS_S))
         self.hands, self.slip = hands, slip
-        self.tested, self.thresholds, self.leaves, self.levels = tested, thresholds, leaves, levels
-        self.trees = len(tested) // levels
-        self.features, self.log_odds, self.evidence_ns = features, log_odds, evidence_ns
-        self.velocities, self.velocity_std = velocities, velocity_std
-        self.own_odds, self.ways, self.due, self.work = own_odds, ways, due, work
+        self.tested, self.thresholds, self.leaves = arrays["tested"], arrays["thresholds"], arrays["leaves"]
+        self.levels, self.trees = levels, len(self.tested) // levels
+        self.features, self.log_odds = arrays["features"], arrays["log_odds"]
+        self.rows = view_rows(np.asarray(arrays["features"]), FEATURE_ROW)
+        self.evidence_ns = arrays["evidence_ns"]
+        self.velocities, self.velocity_std = _numbers(3 * n), _numbers(n)
+        self.ways, self.own_odds, self.due = _numbers(3 * n), _numbers(n), view_memory(np.zeros(n, np.intp))
+        self.body = np.zeros(1, BODY_ROW).view(np.recarray)
+        for pad in range(n):
+            self.velocity_std[pad] = _NAN
+            for i in range(3):
+                self.velocities[3 * pad + i] = _NAN
 
     def update_odds(self, pads: memoryview[int], now_ns: int) -> None:
         """Update the odds of slip of the contacts on these pads, ascending, by samples up to `now_ns`.
@@ -191,20 +206,19 @@ class EvidenceStage:
         The object is a rigid body that moves with its hand's contacts unless they slip or may do so, and at
         rest in the palm without.
         """
-        work, at = self.work, _sample_at(self, pad, 0)
+        at = _sample_at(self, pad, 0)
         if not self.velocity_std[pad] < _INFINITY:
             return False
-        origin, others = at + self.offsets[_PALM_POSITION], 0
+        origin, others = at + self.palm_position_m, 0
         x, y, z = self.history[origin], self.history[origin + 1], self.history[origin + 2]
-        _set_prior(work, _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S)
+        _set_prior(self.body, _OBJECT_SPEED_STD_M_PER_S, _OBJECT_ROTATION_STD_RAD_PER_S)
         for other in range(len(self.hands)):
-            row = other * _SLIP_ROW
-            if other == pad or self.hands[other] != self.hands[pad] or self.slip[row + _ROW_SLIPPING] != 0.0:
+            if other == pad or self.hands[other] != self.hands[pad] or self.slip[other].slipping != 0.0:
                 continue
             std = self.velocity_std[other]
-            if std < _INFINITY and not self.slip[row + _ROW_LOG_ODDS] > _MAX_STICKING_LOG_ODDS:
+            if std < _INFINITY and not self.slip[other].log_odds > _MAX_STICKING_LOG_ODDS:
                 _set_point(self, other, x, y, z)
-                _add_point(work, self.velocities, other, 1.0 / (std * std))
+                _add_point(self.body, self.velocities, other, 1.0 / (std * std))
                 others += 1
         variance = 0.0
         if others:
@@ -213,7 +227,7 @@ class EvidenceStage:
         else:
             _remove_normal(self, self.velocities, pad)
         for i in range(3):
-            out[i] = work[_OFF + i]
+            out[i] = self.body[0].off[i]
         std = self.velocity_std[pad]
         out[3], out[4] = math.sqrt(std * std + variance), float(others)
         return True
@@ -221,6 +235,10 @@ class EvidenceStage:
     def compute_features(self, pads: memoryview[int]) -> None:
         """Compute the features of the contacts on these pads alone."""
         _compute_features(self, pads, len(pads))
+
+
+def _numbers(count: int) -> memoryview[float]:
+    return view_memory(np.zeros(count))
 
 
 def _update_contact(stage: EvidenceStage, pad: int, others: int, total: float, now_ns: int) -> None:
@@ -246,7 +264,7 @@ def _is_placed(stage: EvidenceStage, pad: int) -> bool:
     at = _sample_at(stage, pad, 0)
     if at < 0:
         return False
-    return -_INFINITY < stage.history[at + stage.offsets[_PALM_POSITION]] < _INFINITY
+    return -_INFINITY < stage.history[at + stage.palm_position_m] < _INFINITY
 
 
 def _sample_at(stage: EvidenceStage, pad: int, back: int) -> int:
@@ -259,13 +277,13 @@ def _sample_at(stage: EvidenceStage, pad: int, back: int) -> int:
 
 def _sum_trees(stage: EvidenceStage, pad: int) -> float:
     """Return the sum of the leaves that a pad's features reach; an unknown feature is above no threshold."""
-    levels, row, total, node, size = stage.levels, pad * _COUNT, 0.0, 0, 1
+    levels, first, total, node, size = stage.levels, pad * _COUNT, 0.0, 0, 1
     for _ in range(levels):
         size += size
     for tree in range(stage.trees):
         leaf, bit = tree * size, 1
         for _ in range(levels):
-            if stage.features[row + stage.tested[node]] > stage.thresholds[node]:
+            if stage.features[first + stage.tested[node]] > stage.thresholds[node]:
                 leaf += bit
             bit += bit
             node += 1
@@ -286,13 +304,13 @@ def _compute_features(stage: EvidenceStage, pads: memoryview[int], count: int) -
                 _compute_link_motion(stage, pads[k], link_window)
             _compute_relative_motion(stage, pads, first, stop, link_window)
         for hand_window in range(_HAND_WINDOWS):
-            turned, largest = _TURNED + _LINK_WINDOWS - _HAND_WINDOWS + hand_window, 0.0
+            link_window, largest = _LINK_WINDOWS - _HAND_WINDOWS + hand_window, 0.0
             for k in range(first, stop):
-                angle = stage.features[pads[k] * _COUNT + turned]
+                angle = stage.rows[pads[k]].turned_rad[link_window]
                 if angle > largest:
                     largest = angle
             for k in range(first, stop):
-                stage.features[pads[k] * _COUNT + _HAND_TURNED + hand_window] = largest
+                stage.rows[pads[k]].hand_turned_rad[hand_window] = largest
         for k in range(first, stop):
             _compute_path(stage, pads[k])
         _compute_others(stage, pads, first, stop)
@@ -301,47 +319,48 @@ def _compute_features(stage: EvidenceStage, pads: memoryview[int], count: int) -
 
 def _compute_own_features(stage: EvidenceStage, pad: int) -> None:
     """Compute the features of the slip stage, and those from current and centroid."""
-    row, state, history = pad * _COUNT, pad * _SLIP_ROW, stage.history
-    features, slip = stage.features, stage.slip
-    ratio = slip[state + _ROW_LOG_RATIO]
+    history = stage.history
+    ratio = stage.slip[pad].log_ratio
     if ratio > _MAX_LOG_RATIO:
         ratio = _MAX_LOG_RATIO
     elif ratio < _MIN_LOG_RATIO:
         ratio = _MIN_LOG_RATIO
-    force = slip[state + _ROW_FORCE]
-    x, y = slip[state + _ROW_VELOCITY], slip[state + _ROW_VELOCITY + 1]
-    features[row + _LOG_RATIO], features[row + _SLIPPING] = ratio, slip[state + _ROW_SLIPPING]
-    features[row + _SPEED] = 1e3 * math.sqrt(x * x + y * y)
-    features[row + _ONSET_AGE] = slip[state + _ROW_ONSET_AGE]
-    features[row + _FORCE_RATE] = slip[state + _ROW_RATE] / (force if force > _MIN_FORCE_N else _MIN_FORCE_N)
+    force = stage.slip[pad].force_n
+    x, y = stage.slip[pad].slip_velocity_m_per_s[0], stage.slip[pad].slip_velocity_m_per_s[1]
+    stage.rows[pad].log_ratio, stage.rows[pad].slipping = ratio, stage.slip[pad].slipping
+    stage.rows[pad].slip_mm_per_s = 1e3 * math.sqrt(x * x + y * y)
+    stage.rows[pad].onset_age_s = stage.slip[pad].onset_age_s
+    stage.rows[pad].relative_force_rate_per_s = stage.slip[pad].force_rate_n_per_s / (
+        force if force > _MIN_FORCE_N else _MIN_FORCE_N
+    )
     now = _sample_at(stage, pad, 0)
     for window in range(_WINDOWS):
-        features[row + _CURRENT_CHANGE + window] = features[row + _MOVED + window] = _NAN
+        stage.rows[pad].log_current_change[window] = stage.rows[pad].moved_mm[window] = _NAN
         before = _sample_at(stage, pad, stage.steps[window])
         if before < 0:
             continue
-        at = stage.offsets[_CURRENT]
+        at = stage.total_current_a
         current, earlier = history[now + at], history[before + at]
         if current > 0.0 and earlier > 0.0:
-            features[row + _CURRENT_CHANGE + window] = math.log(current / earlier)
-        at = stage.offsets[_PAD_M]
+            stage.rows[pad].log_current_change[window] = math.log(current / earlier)
+        at = stage.pad_m
         x, y = history[now + at] - history[before + at], history[now + at + 1] - history[before + at + 1]
-        features[row + _MOVED + window] = 1e3 * math.sqrt(x * x + y * y)
+        stage.rows[pad].moved_mm[window] = 1e3 * math.sqrt(x * x + y * y)
 
 
 def _compute_path(stage: EvidenceStage, pad: int) -> None:
     """Compute the features of the centroid's path on the pad over 100 ms; NaN where it isn't known."""
-    row, history, features, now = pad * _COUNT, stage.history, stage.features, _sample_at(stage, pad, 0)
-    at, current, steps = stage.offsets[_PAD_M], stage.offsets[_CURRENT], stage.steps[_PATH_WINDOW]
-    features[row + _STEP] = features[row + _STRAIGHTNESS] = features[row + _EXPLAINED] = _NAN
-    features[row + _PALM_MOVED] = _NAN
+    history, now = stage.history, _sample_at(stage, pad, 0)
+    at, current, steps = stage.pad_m, stage.total_current_a, stage.steps[_PATH_WINDOW]
+    stage.rows[pad].step_mm_100ms = stage.rows[pad].straightness_100ms = _NAN
+    stage.rows[pad].explained_by_current_100ms = stage.rows[pad].palm_moved_mm_100ms = _NAN
     before = _sample_at(stage, pad, steps)
     if before < 0:
         return
-    p, o, square = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION], 0.0
+    p, o, square = now + stage.palm_position_m, before + stage.palm_position_m, 0.0
     for i in range(3):
         square += (history[p + i] - history[o + i]) * (history[p + i] - history[o + i])
-    features[row + _PALM_MOVED] = 1e3 * math.sqrt(square)
+    stage.rows[pad].palm_moved_mm_100ms = 1e3 * math.sqrt(square)
     stride = (steps + _PATH_STEPS - 1) // _PATH_STEPS
     longest = length = count = 0.0
     sum_c = sum_x = sum_y = sum_cc = sum_cx = sum_cy = sum_xx = 0.0
@@ -371,8 +390,8 @@ def _compute_path(stage: EvidenceStage, pad: int) -> None:
     x, y = origin_x - history[before + at], origin_y - history[before + at + 1]
     if not length < _INFINITY:
         return
-    features[row + _STEP] = 1e3 * longest
-    features[row + _STRAIGHTNESS] = math.sqrt(x * x + y * y) / (
+    stage.rows[pad].step_mm_100ms = 1e3 * longest
+    stage.rows[pad].straightness_100ms = math.sqrt(x * x + y * y) / (
         length if length > _MIN_PATH_M else _MIN_PATH_M
     )
     variance = (sum_xx - (sum_x * sum_x + sum_y * sum_y) / count) / count
@@ -380,48 +399,46 @@ def _compute_path(stage: EvidenceStage, pad: int) -> None:
     x, y = (sum_cx - sum_c * sum_x / count) / count, (sum_cy - sum_c * sum_y / count) / count
     if variance < _MIN_PATH_M * _MIN_PATH_M:
         variance = _MIN_PATH_M * _MIN_PATH_M
-    features[row + _EXPLAINED] = (x * x + y * y) / (c * variance)
+    stage.rows[pad].explained_by_current_100ms = (x * x + y * y) / (c * variance)
 
 
 def _compute_others(stage: EvidenceStage, pads: memoryview[int], first: int, stop: int) -> None:
     """Compute the features of a hand's contacts that are about its others; NaN where there is none."""
-    features, slipping, known, change = stage.features, 0.0, 0.0, 0.0
+    slipping = known = change = 0.0
     largest, second, at = _MIN_LOG_RATIO, _MIN_LOG_RATIO, -1
     for k in range(first, stop):
-        row = pads[k] * _COUNT
-        slipping += features[row + _SLIPPING]
-        part = math.fabs(features[row + _CURRENT_CHANGE + _OTHERS_WINDOW])
+        slipping += stage.rows[pads[k]].slipping
+        part = math.fabs(stage.rows[pads[k]].log_current_change[_OTHERS_WINDOW])
         if part < _INFINITY:
             known, change = known + 1.0, change + part
-        if features[row + _LOG_RATIO] > largest:
-            largest, second, at = features[row + _LOG_RATIO], largest, k
-        elif features[row + _LOG_RATIO] > second:
-            second = features[row + _LOG_RATIO]
+        if stage.rows[pads[k]].log_ratio > largest:
+            largest, second, at = stage.rows[pads[k]].log_ratio, largest, k
+        elif stage.rows[pads[k]].log_ratio > second:
+            second = stage.rows[pads[k]].log_ratio
     for k in range(first, stop):
-        row = pads[k] * _COUNT
-        own = math.fabs(features[row + _CURRENT_CHANGE + _OTHERS_WINDOW])
-        features[row + _OTHERS_SLIPPING] = slipping - features[row + _SLIPPING]
-        features[row + _OTHERS_RATIO] = second if k == at else largest
-        features[row + _OTHERS_CHANGE] = _NAN
+        own = math.fabs(stage.rows[pads[k]].log_current_change[_OTHERS_WINDOW])
+        stage.rows[pads[k]].others_slipping = slipping - stage.rows[pads[k]].slipping
+        stage.rows[pads[k]].others_log_ratio = second if k == at else largest
+        stage.rows[pads[k]].others_current_change_20ms = _NAN
         if own < _INFINITY:
             if known > 1.5:
-                features[row + _OTHERS_CHANGE] = (change - own) / (known - 1.0)
+                stage.rows[pads[k]].others_current_change_20ms = (change - own) / (known - 1.0)
         elif known > 0.5:
-            features[row + _OTHERS_CHANGE] = change / known
+            stage.rows[pads[k]].others_current_change_20ms = change / known
 
 
 def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> None:
     """Compute rotation and way of the link's material at the contact over a window, NaN where unknown."""
-    row, at, history, features, ways = pad * _COUNT, 3 * pad, stage.history, stage.features, stage.ways
-    features[row + _TURNED + link_window] = features[row + _LINK_MOVED + link_window] = _NAN
-    features[row + _RELATIVE + link_window] = features[row + _RELATIVE_STD + link_window] = _NAN
+    at, history, ways = 3 * pad, stage.history, stage.ways
+    stage.rows[pad].turned_rad[link_window] = stage.rows[pad].link_moved_mm[link_window] = _NAN
+    stage.rows[pad].relative_mm[link_window] = stage.rows[pad].relative_std_mm[link_window] = _NAN
     ways[at] = _NAN
     now = _sample_at(stage, pad, 0)
     before = _sample_at(stage, pad, stage.steps[_WINDOWS - _LINK_WINDOWS + link_window])
     if before < 0:
         return
     _compute_material_way(stage, pad, now, before)
-    r, q, n = now + stage.offsets[_ROTATION], before + stage.offsets[_ROTATION], now + stage.offsets[_NORMAL]
+    r, q, n = now + stage.palm_rotation, before + stage.palm_rotation, now + stage.palm_normal
     along = ways[at] * history[n] + ways[at + 1] * history[n + 1] + ways[at + 2] * history[n + 2]
     x = y = z = squares = 0.0
     for i in range(3):  # columns of the rotations; their cross products sum to twice the axis
@@ -430,16 +447,16 @@ def _compute_link_motion(stage: EvidenceStage, pad: int, link_window: int) -> No
         z += history[q + i] * history[r + 3 + i] - history[q + 3 + i] * history[r + i]
         off = ways[at + i] - along * history[n + i]
         squares += off * off
-    features[row + _TURNED + link_window] = 0.5 * math.sqrt(x * x + y * y + z * z)
-    features[row + _LINK_MOVED + link_window] = 1e3 * math.sqrt(squares)
+    stage.rows[pad].turned_rad[link_window] = 0.5 * math.sqrt(x * x + y * y + z * z)
+    stage.rows[pad].link_moved_mm[link_window] = 1e3 * math.sqrt(squares)
 
 
 def _compute_material_way(stage: EvidenceStage, pad: int, now: int, before: int) -> None:
     """Compute the way in the palm, between two samples, of the link's point that is in contact now."""
-    history, q = stage.history, before + stage.offsets[_ROTATION]
-    p, o = now + stage.offsets[_POSITION], before + stage.offsets[_POSITION]
+    history, q = stage.history, before + stage.palm_rotation
+    p, o = now + stage.position_m, before + stage.position_m
     a, b, c = history[p] - history[o], history[p + 1] - history[o + 1], history[p + 2] - history[o + 2]
-    p, o = now + stage.offsets[_PALM_POSITION], before + stage.offsets[_PALM_POSITION]
+    p, o = now + stage.palm_position_m, before + stage.palm_position_m
     for i in range(3):
         on_link = history[q + 3 * i] * a + history[q + 3 * i + 1] * b + history[q + 3 * i + 2] * c
         stage.ways[3 * pad + i] = history[p + i] - history[o + i] - on_link
@@ -463,9 +480,7 @@ def _compute_velocity(stage: EvidenceStage, pad: int, now_ns: int) -> None:
     over_s = (last_ns - then_ns) * 1e-9
     for i in range(3):
         stage.velocities[3 * pad + i] = stage.ways[3 * pad + i] / over_s
-    variance_m2 = (
-        stage.history[now + stage.offsets[_JOINTS_M2]] + stage.history[before + stage.offsets[_JOINTS_M2]]
-    )
+    variance_m2 = stage.history[now + stage.palm_joints_m2] + stage.history[before + stage.palm_joints_m2]
     if not 0.0 <= variance_m2 < _INFINITY:
         variance_m2 = 0.0
     variance = variance_m2 / (over_s * over_s)  # as if independent in every sample
@@ -480,9 +495,8 @@ def _is_known(stage: EvidenceStage, pad: int) -> bool:
 
 def _is_holding(stage: EvidenceStage, pad: int) -> bool:
     """Return True if a contact counts as sticking to the object."""
-    row = pad * _COUNT
-    slipping, ratio = stage.features[row + _SLIPPING], stage.features[row + _LOG_RATIO]
-    return slipping == 0.0 and ratio < _MAX_HOLDING_LOG_RATIO
+    ratio: float = stage.rows[pad].log_ratio
+    return not stage.rows[pad].slipping and ratio < _MAX_HOLDING_LOG_RATIO
 
 
 def _compute_relative_motion(
@@ -490,22 +504,22 @@ def _compute_relative_motion(
 ) -> None:
     """Compute the ways of a hand's contacts, each relative to a rigid body on the other holding contacts, and
     the deviation of a component of that body's way."""
-    work, history, known, holding = stage.work, stage.history, 0, 0
+    history, known, holding = stage.history, 0, 0
     x = y = z = 0.0
     for k in range(first, stop):
         if _is_known(stage, pads[k]):
-            at = _sample_at(stage, pads[k], 0) + stage.offsets[_PALM_POSITION]
+            at = _sample_at(stage, pads[k], 0) + stage.palm_position_m
             x, y, z = x + history[at], y + history[at + 1], z + history[at + 2]
             known += 1
     if known < 2:
         return
     x, y, z = x / known, y / known, z / known
     window_s = stage.windows[_WINDOWS - _LINK_WINDOWS + link_window]
-    _set_prior(work, _OBJECT_SPEED_STD_M_PER_S * window_s, _OBJECT_ROTATION_STD_RAD_PER_S * window_s)
+    _set_prior(stage.body, _OBJECT_SPEED_STD_M_PER_S * window_s, _OBJECT_ROTATION_STD_RAD_PER_S * window_s)
     for k in range(first, stop):
         if _is_known(stage, pads[k]) and _is_holding(stage, pads[k]):
             _set_point(stage, pads[k], x, y, z)
-            _add_point(work, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
+            _add_point(stage.body, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
             holding += 1
     for k in range(first, stop):
         if not _is_known(stage, pads[k]):
@@ -515,71 +529,77 @@ def _compute_relative_motion(
             continue
         _set_point(stage, pads[k], x, y, z)
         if own:
-            _add_point(work, stage.ways, pads[k], -1.0 / _CONTACT_VARIANCE_M2)
-        variance, squares, row = _compare_to_body(stage, stage.ways, pads[k]), 0.0, pads[k] * _COUNT
+            _add_point(stage.body, stage.ways, pads[k], -1.0 / _CONTACT_VARIANCE_M2)
+        variance, squares = _compare_to_body(stage, stage.ways, pads[k]), 0.0
         for i in range(3):
-            squares += work[_OFF + i] * work[_OFF + i]
-        stage.features[row + _RELATIVE + link_window] = 1e3 * math.sqrt(squares)
-        stage.features[row + _RELATIVE_STD + link_window] = 1e3 * math.sqrt(variance)
+            squares += stage.body[0].off[i] * stage.body[0].off[i]
+        stage.rows[pads[k]].relative_mm[link_window] = 1e3 * math.sqrt(squares)
+        stage.rows[pads[k]].relative_std_mm[link_window] = 1e3 * math.sqrt(variance)
         if own:
             _set_point(stage, pads[k], x, y, z)
-            _add_point(work, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
+            _add_point(stage.body, stage.ways, pads[k], 1.0 / _CONTACT_VARIANCE_M2)
 
 
 def _set_point(stage: EvidenceStage, pad: int, x: float, y: float, z: float) -> None:
-    """Set the (3, 6) ways of a contact's point per way and rotation of a body at (x, y, z)."""
-    work, at = stage.work, _sample_at(stage, pad, 0) + stage.offsets[_PALM_POSITION]
+    """Set the ways of a contact's point per way and rotation of a body at (x, y, z)."""
+    at = _sample_at(stage, pad, 0) + stage.palm_position_m
     x, y, z = stage.history[at] - x, stage.history[at + 1] - y, stage.history[at + 2] - z
-    for i in range(3 * _MOTION):
-        work[_POINT + i] = 0.0
-    work[_POINT], work[_POINT + 7], work[_POINT + 14] = 1.0, 1.0, 1.0
-    work[_POINT + 4], work[_POINT + 5], work[_POINT + 9] = z, -y, -z
-    work[_POINT + 11], work[_POINT + 15], work[_POINT + 16] = x, y, -x
-
-
-def _set_prior(work: memoryview[float], speed: float, rotation: float) -> None:
-    """Set the information about a body's motion to that of a prior of these deviations."""
-    for i in range(_FACTOR):
-        work[_INFORMATION + i] = 0.0
     for i in range(3):
-        work[_INFORMATION + 7 * i] = 1.0 / (speed * speed)
-        work[_INFORMATION + 7 * (i + 3)] = 1.0 / (rotation * rotation)
+        for j in range(_MOTION):
+            stage.body[0].point[i][j] = 1.0 if i == j else 0.0
+    stage.body[0].point[0][4], stage.body[0].point[0][5] = z, -y
+    stage.body[0].point[1][3], stage.body[0].point[1][5] = -z, x
+    stage.body[0].point[2][3], stage.body[0].point[2][4] = y, -x
 
 
-def _add_point(work: memoryview[float], ways: memoryview[float], pad: int, weight: float) -> None:
+def _set_prior(body: RowArray, speed: float, rotation: float) -> None:
+    """Set the information about a body's motion to that of a prior of these deviations."""
+    for i in range(_MOTION):
+        body[0].weighted[i] = 0.0
+        for j in range(_MOTION):
+            body[0].information[i][j] = 0.0
+    for i in range(3):
+        body[0].information[i][i] = 1.0 / (speed * speed)
+        body[0].information[i + 3][i + 3] = 1.0 / (rotation * rotation)
+
+
+def _add_point(body: RowArray, ways: memoryview[float], pad: int, weight: float) -> None:
     """Add what the point that was set, of a pad, contributes to the body's motion."""
     for i in range(3):
-        at, way = _POINT + _MOTION * i, ways[3 * pad + i]
+        way = ways[3 * pad + i]
         for j in range(_MOTION):
-            part = weight * work[at + j]
-            work[_WEIGHTED + j] += part * way
+            part = weight * body[0].point[i][j]
+            body[0].weighted[j] += part * way
             for m in range(j + 1):
-                work[_INFORMATION + _MOTION * j + m] += part * work[at + m]
+                body[0].information[j][m] += part * body[0].point[i][m]
 
 
 def _compare_to_body(stage: EvidenceStage, ways: memoryview[float], pad: int) -> float:
     """Compute the tangential way, relative to the body, of the point that was set, of a pad; return the
     variance of a component of the body's way."""
-    work = stage.work
-    normal = _sample_at(stage, pad, 0) + stage.offsets[_NORMAL]
-    _factorise(work)
-    for i in range(_MOTION):  # L^-1 of the weighted ways, and of the point's three rows, in place
-        work[_BODY + i] = _substitute(work, _WEIGHTED, _BODY, i)
+    normal = _sample_at(stage, pad, 0) + stage.palm_normal
+    _factorise(stage.body)
+    for i in range(_MOTION):
+        value = stage.body[0].weighted[i]
+        for j in range(i):
+            value -= stage.body[0].factor[i][j] * stage.body[0].motion[j]
+        stage.body[0].motion[i] = value / stage.body[0].factor[i][i]
     along = trace = spread = 0.0
     for i in range(3):
-        at, way = _POINT + _MOTION * i, ways[3 * pad + i]
+        _whiten_row(stage.body, i)
+        way = ways[3 * pad + i]
         for j in range(_MOTION):
-            work[at + j] = _substitute(work, at, at, j)
-            way -= work[at + j] * work[_BODY + j]
-            trace += work[at + j] * work[at + j]
-        work[_OFF + i] = way
+            value = stage.body[0].point[i][j]
+            way -= value * stage.body[0].motion[j]
+            trace += value * value
+        stage.body[0].off[i] = way
         along += way * stage.history[normal + i]
     for i in range(3):
-        work[_OFF + i] -= along * stage.history[normal + i]
+        stage.body[0].off[i] -= along * stage.history[normal + i]
     for j in range(_MOTION):
         part = 0.0
         for i in range(3):
-            part += work[_POINT + _MOTION * i + j] * stage.history[normal + i]
+            part += stage.body[0].point[i][j] * stage.history[normal + i]
         spread += part * part
     variance = 0.5 * (trace - spread)
     return variance if variance > 0.0 else 0.0
@@ -587,29 +607,30 @@ def _compare_to_body(stage: EvidenceStage, ways: memoryview[float], pad: int) ->
 
 def _remove_normal(stage: EvidenceStage, ways: memoryview[float], pad: int) -> None:
     """Compute the tangential way of a pad's point, relative to a body at rest."""
-    normal, along = _sample_at(stage, pad, 0) + stage.offsets[_NORMAL], 0.0
+    normal, along = _sample_at(stage, pad, 0) + stage.palm_normal, 0.0
     for i in range(3):
         along += ways[3 * pad + i] * stage.history[normal + i]
     for i in range(3):
-        stage.work[_OFF + i] = ways[3 * pad + i] - along * stage.history[normal + i]
+        stage.body[0].off[i] = ways[3 * pad + i] - along * stage.history[normal + i]
 
 
-def _substitute(work: memoryview[float], given: int, solved: int, i: int) -> float:
-    """Return component i of L^-1 of a vector, after the components before it were solved."""
-    value, row = work[given + i], _FACTOR + _MOTION * i
-    for j in range(i):
-        value -= work[row + j] * work[solved + j]
-    return value / work[row + i]
+def _whiten_row(body: RowArray, i: int) -> None:
+    """Replace row i of the point's ways by L^-1 of it."""
+    for j in range(_MOTION):
+        value = body[0].point[i][j]
+        for m in range(j):
+            value -= body[0].factor[j][m] * body[0].point[i][m]
+        body[0].point[i][j] = value / body[0].factor[j][j]
 
 
-def _factorise(work: memoryview[float]) -> None:
+def _factorise(body: RowArray) -> None:
     """Compute the Cholesky factor of the information about the body's motion."""
     for i in range(_MOTION):
         for j in range(i + 1):
-            value = work[_INFORMATION + _MOTION * i + j]
+            value = body[0].information[i][j]
             for m in range(j):
-                value -= work[_FACTOR + _MOTION * i + m] * work[_FACTOR + _MOTION * j + m]
+                value -= body[0].factor[i][m] * body[0].factor[j][m]
             if i == j:
-                work[_FACTOR + 7 * i] = math.sqrt(value if value > _MIN_PIVOT else _MIN_PIVOT)
+                body[0].factor[i][i] = math.sqrt(value if value > _MIN_PIVOT else _MIN_PIVOT)
             else:
-                work[_FACTOR + _MOTION * i + j] = value / work[_FACTOR + 7 * j]
+                body[0].factor[i][j] = value / body[0].factor[j][j]

@@ -80,11 +80,6 @@ class LinkPoses:
         """Return the pose of link number `link` in the base frame."""
         return _pose(self, link, True)
 
-    def direction_in_links(self, in_base: FloatArray) -> FloatArray:
-        """Return a direction (3,) of the base frame in the frame of each link, (n, 3)."""
-        rotations = [self.pose_in_base(link).rotation for link in range(self.links)]
-        return np.asarray(in_base @ np.array(rotations).reshape(-1, 3, 3))
-
     def joint_covariance_m2(
         self, link: int, position_m: ArrayLike, std_rad: FloatArray, in_base: bool = False
     ) -> FloatArray:

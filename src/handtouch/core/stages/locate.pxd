@@ -3,10 +3,10 @@ from libc cimport math
 from handtouch.core.stages cimport tables, tolerances
 
 cdef Py_ssize_t _MAX_STEPS, _CORNER_STEPS, _BISECTIONS, _EDGE_BISECTIONS
-cdef double _MAX_STEP_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
+cdef double _MAX_STEP_CELLS, _MAX_CORNER_CELLS, _MAX_SETTLED_DECREMENT, _FIRST_DAMPING, _MIN_DAMPING, _MAX_TRACKED_COST, _MAX_TRACKED_VARIANCE
 cdef Py_ssize_t _MAX_WHITENINGS, _ELONGATED_WHITENINGS
 cdef double _MAX_WHITENING_CELLS, _FOURTH_MOMENTS
-cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
+cdef double _MAX_START_COST, _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR, _MIN_CHANNEL_SUM, _MAX_CORNER_RADIUS, _MIN_CORNER_ANGLE_RAD
 cdef double _MAX_EDGE_CELLS, _UNIFORM_VARIANCE, _MIN_INFORMATION, _INFINITY, _HALF_PI
 cdef double _MIN_LONG_ASPECT, _MAX_PROFILE_STEP, _MAX_INSIDE, _TWO_PI
 cdef Py_ssize_t _PROFILE_POINTS, _PROFILE_STEPS
@@ -15,6 +15,7 @@ cdef class ModelTable:
     cdef double[::1] values, nodes_x, nodes_y, search_fractions, search_cells
     cdef Py_ssize_t cells, electrodes, points
     cdef double side_x, side_y, misfit_scale
+    cdef bint is_potential
 
 cdef class Fit:
     cdef double[::1] readings, data, weight, fractions, slope_x, slope_y, raw, beside, scaled, gain
@@ -45,6 +46,9 @@ cdef void _refine(
 @cython.locals(i=Py_ssize_t)
 cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
 cdef void _read_model(ModelTable table, Fit fit) noexcept
+cdef void read_beside(ModelTable table, Fit fit, double s, double t) noexcept
+@cython.locals(i=Py_ssize_t, share=double)
+cdef double channel_sum(ModelTable table, Fit fit) noexcept
 cdef double clamp(ModelTable table, double s) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef double coordinate(double[::1] nodes, Py_ssize_t cells, double s) noexcept
@@ -64,6 +68,7 @@ cdef void _search(ModelTable table, Fit fit, bint located) noexcept
 cdef void _add_other_positions(ModelTable table, Fit fit) noexcept
 @cython.locals(k=Py_ssize_t, row=Py_ssize_t, column=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, best=Py_ssize_t,
                is_peak=bint)
+cdef double _nearer_corner(ModelTable table, double s) noexcept
 cdef Py_ssize_t _highest_peak(Fit fit, Py_ssize_t points, Py_ssize_t excluded) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void _compute_covariance(ModelTable table, Fit fit) noexcept

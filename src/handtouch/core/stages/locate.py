@@ -34,8 +34,10 @@ _MAX_WHITENINGS, _ELONGATED_WHITENINGS = 3, 2
 _FOURTH_MOMENTS = 5.0  # of a line: L^4 / 1920 d^4 f, fractions of about 1 / 6 that vary as sin(pi x / side)
 _MAX_START_COST = 40.0  # cost beyond twice the best start's at which another one is still tried
 _MAX_STD_SIDES, _CORNER_RADIUS_FACTOR = MAX_STD_SIDES, CORNER_RADIUS_FACTOR
+_MIN_CHANNEL_SUM = 1e-6  # of a map where nothing responds
 _MAX_CORNER_RADIUS = 0.25  # in shorter sides
 _CORNER_STEPS = 6
+_MAX_CORNER_CELLS = 24.0  # from both edges, within which likelihoods may have two maxima
 _UNIFORM_VARIANCE = 1.0 / 12.0  # of a position anywhere on a side, in squares of the side
 _MAX_EDGE_CELLS = 0.5  # of a position on an edge
 _EDGE_BISECTIONS = 12
@@ -54,10 +56,13 @@ class ModelTable:
     (2 (cells + 1),) coordinate of each node, and its derivative by cell. search_fractions: (points^2, n) on a
     square grid, x fastest; search_cells: (2 points,) its coordinates along x, then y, in cells. misfit_scale:
     from the squared misfit of n currents, n - 3 degrees of freedom, to one that is as likely of one.
+    is_potential: the fractions are potentials of one sheet, harmonic, and vanish with the distance from a
+    corner.
     """
 
-    def __init__(self, table: ForwardTable, states: int) -> None:
+    def __init__(self, table: ForwardTable, states: int, is_potential: bool = True) -> None:
         """Take a pad's table; `states`: of a schedule, 1 without one."""
+        self.is_potential = is_potential
         self.values = view_memory(table.nodes)
         self.cells, self.electrodes, self.points = len(table.nodes) - 1, table.electrodes, SEARCH_POINTS
         self.nodes_x, self.nodes_y = view_memory(table.nodes_x), view_memory(table.nodes_y)
@@ -142,7 +147,8 @@ def locate(
     fit.found = fit.total > 0.0
     if fit.found:
         _add_other_positions(table, fit)
-        _move_out_of_corner(table, fit)
+        if table.is_potential:
+            _move_out_of_corner(table, fit)
         _widen_at_edge(table, fit, True)
         _widen_at_edge(table, fit, False)
         _bound_by_pad(table, fit)
@@ -165,7 +171,7 @@ def locate_elongated(
     for _ in range(_ELONGATED_WHITENINGS):
         fit.read_s = fit.read_t = _INFINITY
         _read_model(table, fit)
-        total = max(fit.sum, 0.0)
+        total = max(fit.sum, 0.0) / channel_sum(table, fit)
         tolerances.whiten_elongated(
             fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t, moment_std, error_std
         )
@@ -185,7 +191,7 @@ def _whiten(
     """Whiten for noise and tolerances at (s, t)."""
     n = table.electrodes
     _read_model(table, fit)
-    total = max(fit.sum, 0.0)
+    total = max(fit.sum, 0.0) / channel_sum(table, fit)
     tolerances.whiten(fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t)
     for i in range(n):
         fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
@@ -215,6 +221,21 @@ def _read_model(table: ModelTable, fit: Fit) -> None:
     if fit.s != fit.read_s or fit.t != fit.read_t:
         tables.read_table(table.values, 0, table.cells, table.electrodes + 1, fit.s, fit.t, fit.raw)
         fit.read_s, fit.read_t = fit.s, fit.t
+
+
+def read_beside(table: ModelTable, fit: Fit, s: float, t: float) -> None:
+    """Read the table at (s, t) into `beside`."""
+    tables.read_table(table.values, 0, table.cells, table.electrodes + 1, s, t, fit.beside)
+
+
+def channel_sum(table: ModelTable, fit: Fit) -> float:
+    """Return the sum of the fractions that were read from the table; that of a sheet is 1."""
+    if table.is_potential:
+        return 1.0
+    share = 0.0
+    for i in range(table.electrodes):
+        share += fit.raw[i]
+    return max(share, _MIN_CHANNEL_SUM)
 
 
 def clamp(table: ModelTable, s: float) -> float:
@@ -396,9 +417,23 @@ def _search(table: ModelTable, fit: Fit, located: bool) -> None:
         _maximise(table, fit, False)
         if fit.total > 0.0 and fit.cost < best_cost:
             best_s, best_t, best_cost = fit.s, fit.t, fit.cost
+    fit.s, fit.t = _nearer_corner(table, best_s), _nearer_corner(table, best_t)
+    if fit.s != best_s and fit.t != best_t and best_cost > _MAX_SETTLED_DECREMENT:
+        _maximise(table, fit, False)
+        if fit.total > 0.0 and fit.cost < best_cost:
+            best_s, best_t = fit.s, fit.t
     fit.s, fit.t = best_s, best_t
     _linearise(table, fit)
     fit.step_s = fit.step_t = fit.decrement = 0.0
+
+
+def _nearer_corner(table: ModelTable, s: float) -> float:
+    """Return a coordinate half as far from the nearer edge, in cells, unless it is far from both.
+
+    There may be two maxima between the bare ends of electrodes; the search points are farther inside."""
+    if s < _MAX_CORNER_CELLS:
+        return 0.5 * s
+    return 0.5 * (s + table.cells) if table.cells - s < _MAX_CORNER_CELLS else s
 
 
 def _add_other_positions(table: ModelTable, fit: Fit) -> None:
@@ -614,6 +649,8 @@ def _widen_at_edge(table: ModelTable, fit: Fit, along_x: bool) -> None:
             likely = inward
         else:
             unlikely = inward
+    if likely == 0.0:
+        likely = unlikely  # nearer than the bisection resolves
     fit.s, fit.t = s, t
     _linearise(table, fit)
     fit.step_s = fit.step_t = fit.decrement = 0.0

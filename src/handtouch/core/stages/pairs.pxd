@@ -18,8 +18,6 @@ cdef class PairFit:
     cdef public bint is_settled, is_unique
     cdef public bint found
 
-cpdef Py_ssize_t work_size(Py_ssize_t electrodes, Py_ssize_t grid_points)
-cpdef Py_ssize_t grid_points(Py_ssize_t search_points)
 @cython.locals(_=Py_ssize_t, k=Py_ssize_t, i=Py_ssize_t, explained=bint)
 cdef void fit_pair(
     locate.ModelTable table, locate.Fit fit, PairFit pair, tolerances.PadTolerances pad,

@@ -10,6 +10,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import SEARCH_POINTS
 from handtouch.core.stages import locate, tables, tolerances
 
 _GRID_STEP, _STARTS, _MAX_STEPS, _MAX_WHITENINGS = 2, 10, 40, 4
@@ -37,47 +41,28 @@ class PairFit:
     of least information. solutions: (5 count,) pairs found, with their cost; apart: (4,) distance of others.
     """
 
-    def __init__(self, electrodes: int, grid_points: int, work: memoryview[float]) -> None:
-        n, points = electrodes, grid_points * grid_points
-        self.grid_points = grid_points
-        first = 0
-        self.raw, first = work[first : first + 3 * (n + 1)], first + 3 * (n + 1)
-        self.fractions, first = work[first : first + 2 * n], first + 2 * n
-        self.whitened, first = work[first : first + 2 * n], first + 2 * n
-        self.slopes, first = work[first : first + 4 * n], first + 4 * n
-        self.spreading, first = work[first : first + 6], first + 6
-        self.normal, first = work[first : first + 16], first + 16
-        self.factor, first = work[first : first + 16], first + 16
-        self.covariance, first = work[first : first + 16], first + 16
-        self.gradient, first = work[first : first + 4], first + 4
-        self.step, first = work[first : first + 4], first + 4
-        self.mixing, first = work[first : first + 8], first + 8
-        self.place, first = work[first : first + 4], first + 4
-        self.best, first = work[first : first + 4], first + 4
-        self.other, first = work[first : first + 4], first + 4
-        self.total, first = work[first : first + 2], first + 2
-        self.var_total, first = work[first : first + 2], first + 2
-        self.with_total, first = work[first : first + 4], first + 4
-        self.weakest, first = work[first : first + 4], first + 4
-        self.apart, first = work[first : first + 4], first + 4
-        kept = _SOLUTION * _MAX_SOLUTIONS
-        self.solutions, first = work[first : first + kept], first + kept
-        self.grid, first = work[first : first + points * n], first + points * n
-        self.gain = work[first : first + points * points]
+    def __init__(self, electrodes: int) -> None:
+        """Prepare for pads of at most so many electrodes."""
+        n = electrodes
+        self.grid_points = (SEARCH_POINTS + _GRID_STEP - 1) // _GRID_STEP
+        points = self.grid_points * self.grid_points
+        self.raw, self.fractions = _numbers(3 * (n + 1)), _numbers(2 * n)
+        self.whitened, self.slopes = _numbers(2 * n), _numbers(4 * n)
+        self.spreading = _numbers(6)
+        self.normal, self.factor, self.covariance = _numbers(16), _numbers(16), _numbers(16)
+        self.gradient, self.step, self.mixing = _numbers(4), _numbers(4), _numbers(8)
+        self.place, self.best, self.other = _numbers(4), _numbers(4), _numbers(4)
+        self.total, self.var_total, self.with_total = _numbers(2), _numbers(2), _numbers(4)
+        self.weakest, self.apart = _numbers(4), _numbers(4)
+        self.solutions = _numbers(_SOLUTION * _MAX_SOLUTIONS)
+        self.grid, self.gain = _numbers(points * n), _numbers(points * points)
         self.cost = self.decrement = self.g11 = self.g12 = self.g22 = 0.0
         self.count = 0
         self.is_settled = self.is_unique = self.found = False
 
 
-def work_size(electrodes: int, grid_points: int) -> int:
-    """Return the size of the working memory of a `PairFit`."""
-    points, kept = grid_points * grid_points, _SOLUTION * _MAX_SOLUTIONS
-    return 3 * (electrodes + 1) + 8 * electrodes + 94 + kept + points * electrodes + points * points
-
-
-def grid_points(search_points: int) -> int:
-    """Return the number of grid points along a side, of those of the search for one contact."""
-    return (search_points + _GRID_STEP - 1) // _GRID_STEP
+def _numbers(count: int) -> memoryview[float]:
+    return view_memory(np.zeros(count))
 
 
 def fit_pair(

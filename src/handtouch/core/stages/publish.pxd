@@ -7,19 +7,21 @@ cdef Py_ssize_t _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVA
 cdef Py_ssize_t _INTEGER, _SECONDS, _NAME, _TRUTH, _NUMBERS, _SUM, _WHOLE, _TEXT, _PARTS
 cdef Py_ssize_t _ALWAYS, _LOCATED, _STD, _FRAMES, _PALM, _BASE, _MODELLED, _VECTOR, _PART_PALM, _PART_BASE
 cdef Py_ssize_t _SEQ, _T, _EVENT, _ID, _BEGIN, _POSITION_STATUS, _FORCE_STATUS, _REASON, _RETAINED, _GROUP
-cdef Py_ssize_t _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE
+cdef Py_ssize_t _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE, _RADIUS_STATUS
 cdef long long _MAX_SILENT_PERIODS
-cdef double _SECONDS_PER_NS, _MAX_SQUARED_MISFIT, _BOUNDED_ESTIMATE, _WIDE_ESTIMATE, _NAN, _INFINITY
+cdef Py_ssize_t _MISFIT_COUNT
+cdef double _SECONDS_PER_NS, _MAX_SQUARED_MISFIT, _MAX_LASTING_MISFIT, _BOUNDED_ESTIMATE, _WIDE_ESTIMATE, _NAN
+cdef double _MAX_NUMBER, _MIN_NUMBER, _MAX_RADIUS_STATUS
 
 cdef class ContactColumns:
     cdef Py_ssize_t pads, count
-    cdef unsigned char[::1] position_unreliable, position_status, force_status, solved
+    cdef unsigned char[::1] position_unreliable, position_status, force_status, radius_status, solved
     cdef unsigned char[::1] position_requested, force_requested, known, reliability
     cdef unsigned int[::1] contact_id
     cdef ColumnRow[::1] columns
     cdef ValueRow[::1] contacts
     cdef float[::1] published, published_current_a
-    cdef double[::1] values, total_current_a, uncompensated_force_n, uncompensated_std_n, peak_force_n
+    cdef double[::1] values, total_current_a, uncompensated_force_n, uncompensated_std_n, peak_force_n, misfits
     @cython.locals(k=Py_ssize_t, pad=Py_ssize_t)
     cpdef store_solved(self, Py_ssize_t[::1] pads)
     @cython.locals(pad=Py_ssize_t, i=Py_ssize_t)
@@ -32,14 +34,14 @@ cdef bint _is_finite(double value) noexcept
 cdef bint _is_located(ValueRow[::1] contacts, Py_ssize_t pad) noexcept
 @cython.locals(i=Py_ssize_t, known=bint)
 cdef bint _has_mount(ValueRow[::1] contacts, Py_ssize_t pad) noexcept
-@cython.locals(first=Py_ssize_t, i=Py_ssize_t, value=double, misfit=double, estimate=double, has_mount=bint,
-               no_point=bint, is_odd=bint, position=Py_ssize_t, force=Py_ssize_t)
+@cython.locals(first=Py_ssize_t, i=Py_ssize_t, value=double, std=double, misfit=double, estimate=double, has_mount=bint,
+               no_point=bint, is_odd=bint, is_bounded=bint, position=Py_ssize_t, force=Py_ssize_t, radius=double)
 cdef void _publish_contact(ContactColumns columns, Py_ssize_t pad) noexcept
 
 cdef class ContactEncoder:
     cdef object model, pack, buffer
     cdef list topics, calibrations, own_texts
-    cdef unsigned char[::1] position_status, force_status, has_sheet_model, texts, pad_texts
+    cdef unsigned char[::1] position_status, force_status, radius_status, has_sheet_model, texts, pad_texts
     cdef unsigned char[::1] message, synchronous, palm_requested, base_requested, palm_status, base_status
     cdef unsigned char[::1] vector_status, conditions
     cdef unsigned int[::1] contact_id, group_id

@@ -20,9 +20,15 @@ from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, v
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.force import BOUNDED, WIDE
 from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
-from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
+from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
 from handtouch.wire import ContactEvent, EndReason
-from handtouch.wire.status import MAX_SILENT_PERIODS, ForceStatus, FrameStatus, PositionStatus
+from handtouch.wire.status import (
+    MAX_SILENT_PERIODS,
+    ContactRadiusStatus,
+    ForceStatus,
+    FrameStatus,
+    PositionStatus,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,10 +64,16 @@ FIELD_ROW = np.dtype(
 """A field of a contact message, or of one of two contacts on a pad"""
 _VALUES = row_count(VALUE_ROW)
 _PLACES_OF_VALUES = slices_of(VALUE_ROW)
-_MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
+_MAX_SQUARED_MISFIT, _MISFIT_COUNT = MAX_SQUARED_MISFIT, MISFIT_COUNT
+_MAX_LASTING_MISFIT = MAX_SQUARED_MISFIT / 2
+"""Mean squared misfit of a pad's last contacts, each at most MAX_SQUARED_MISFIT, beyond which the next is no
+better known: with a dead channel, 1 of 10 contacts fits, at a wrong place. Crosstalk of 1 % has 2 to 3."""
 _BOUNDED_ESTIMATE, _WIDE_ESTIMATE = float(BOUNDED), float(WIDE)
-_NAN, _INFINITY = float("nan"), float("inf")
+_NAN = float("nan")
+_MAX_NUMBER, _MIN_NUMBER = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)
+"""Largest and smallest of single precision, in which columns are"""
 _NOT_COMPUTED, _POSITION_VALID, _POSITION_UNRELIABLE, _POSITION_INVALID = map(int, PositionStatus)
+_MAX_RADIUS_STATUS = float(max(ContactRadiusStatus))
 _NOT_COMPUTED, _FORCE_VALID, _FORCE_LOWER_BOUND, _FORCE_UNRELIABLE, _FORCE_INVALID = map(int, ForceStatus)
 _EVIDENCE_MISSING = 0  # ForceReliability.UNRELIABLE
 _FRAME_VALID = int(FrameStatus.VALID)
@@ -85,11 +97,12 @@ _ALWAYS, _LOCATED, _STD, _FRAMES, _PALM, _BASE, _MODELLED, _VECTOR, _PART_PALM, 
 INTEGERS = (
     "seq", "t_ns", "event", "id", "begin_ns", "position_status", "force_status", "end_reason", "retained",
     "group", "palm_status", "base_status", "fresh", "force_vector_status", "duration_s", "age_s",
+    "contact_radius_status",
 )  # fmt: skip
 """Integers, truth values, numbers of names, and durations in nanoseconds."""
 (
     _SEQ, _T, _EVENT, _ID, _BEGIN, _POSITION_STATUS, _FORCE_STATUS, _REASON, _RETAINED,
-    _GROUP, _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE,
+    _GROUP, _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE, _RADIUS_STATUS,
 ) = range(len(INTEGERS))  # fmt: skip
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
@@ -101,6 +114,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "palm_status": tuple(status.text for status in FrameStatus),
     "base_status": tuple(status.text for status in FrameStatus),
     "force_vector_status": tuple(status.text for status in ForceStatus),
+    "contact_radius_status": tuple(status.text for status in ContactRadiusStatus),
 }
 """Texts of a field by its number"""
 _TRUTHS, _DURATIONS = ("retained", "fresh"), ("duration_s", "age_s")
@@ -147,6 +161,7 @@ class ContactColumns:
             view_memory(columns.position_status),
             view_memory(columns.force_status),
         )
+        self.radius_status = view_memory(columns.contact_radius_status)
         self.values, self.contacts = memory["values"], view_rows(state.values, VALUE_ROW)
         self.total_current_a = memory["total_current_a"]
         self.contact_id, self.solved = memory["contact_id"], memory["solved"]
@@ -156,6 +171,7 @@ class ContactColumns:
         )
         self.uncompensated_force_n = memory["uncompensated_force_n"]
         self.uncompensated_std_n = memory["uncompensated_std_n"]
+        self.misfits = memory["misfits"]
         self.known, self.reliability = memory["known"], memory["force_reliability"]
         self.peak_force_n = memory["peak_force_n"]
 
@@ -178,6 +194,7 @@ class ContactColumns:
                 _publish_contact(self, pad)
             elif self.position_status[pad] != _NOT_COMPUTED or self.force_status[pad] != _NOT_COMPUTED:
                 self.position_status[pad] = self.force_status[pad] = _NOT_COMPUTED
+                self.radius_status[pad] = _NOT_COMPUTED
                 for i in range(self.count):
                     self.published[_published_index(self, pad, i)] = _NAN
 
@@ -201,7 +218,7 @@ def _published_index(columns: ContactColumns, pad: int, i: int) -> int:
 
 
 def _is_finite(value: float) -> bool:
-    return -_INFINITY < float(value) < _INFINITY  # a number of a row isn't one of Python's
+    return -_MAX_NUMBER < float(value) < _MAX_NUMBER  # a number of a row isn't one of Python's
 
 
 def _is_located(contacts: RowArray, pad: int) -> bool:
@@ -230,27 +247,32 @@ def _publish_contact(columns: ContactColumns, pad: int) -> None:
             value += columns.values[first + columns.columns[i].added]
         columns.published[_published_index(columns, pad, i)] = value if _is_finite(value) else _NAN
     misfit, estimate = columns.contacts[pad].squared_misfit, columns.contacts[pad].force_status
+    is_odd = misfit > _MAX_SQUARED_MISFIT or columns.misfits[_MISFIT_COUNT * pad] > _MAX_LASTING_MISFIT
     position = _POSITION_INVALID if columns.position_requested[pad] else _NOT_COMPUTED
     if _is_located(columns.contacts, pad):
-        no_point = misfit > _MAX_SQUARED_MISFIT or columns.contacts[pad].is_bound != 0.0
+        no_point = is_odd or columns.contacts[pad].is_bound != 0.0
         position = _POSITION_VALID
         if no_point or columns.position_unreliable[pad]:
             position = _POSITION_UNRELIABLE
     columns.position_status[pad] = position
     value = columns.contacts[pad].force_n
+    std, is_bounded = columns.contacts[pad].force_std_n, estimate == _BOUNDED_ESTIMATE
     force = _NOT_COMPUTED
     if columns.force_requested[pad]:
         force = _FORCE_VALID
-        if not _is_finite(value):
+        if not (_is_finite(value) and (is_bounded or _MIN_NUMBER < std < _MAX_NUMBER)):
             force = _FORCE_INVALID
-        elif estimate == _BOUNDED_ESTIMATE:
+        elif is_bounded:
             force = _FORCE_LOWER_BOUND
         elif not columns.known[pad] or columns.reliability[pad] == _EVIDENCE_MISSING:
             force = _FORCE_UNRELIABLE
-        is_odd = estimate == _WIDE_ESTIMATE or misfit > _MAX_SQUARED_MISFIT
-        if force == _FORCE_VALID and is_odd:
+        if force == _FORCE_VALID and (is_odd or estimate == _WIDE_ESTIMATE):
             force = _FORCE_UNRELIABLE
     columns.force_status[pad] = force
+    radius = columns.contacts[pad].contact_radius_status
+    columns.radius_status[pad] = _NOT_COMPUTED
+    if columns.force_requested[pad] and 0.0 <= radius <= _MAX_RADIUS_STATUS:
+        columns.radius_status[pad] = int(radius)
     if value == value and not columns.peak_force_n[pad] >= value:
         columns.peak_force_n[pad] = value
 
@@ -306,6 +328,7 @@ class ContactEncoder:
         self.parts_palm, self.parts_base = frames["palm"], frames["base"]
         self.position_status = view_memory(columns.position_status)
         self.force_status = view_memory(columns.force_status)
+        self.radius_status = view_memory(columns.contact_radius_status)
         self.has_sheet_model = view_memory(has_sheet_model)
         self.contact_seq, self.contact_id = memory["contact_seq"], memory["contact_id"]
         self.sample_ns, self.begin_ns = memory["sample_ns"], memory["begin_ns"]
@@ -339,8 +362,8 @@ class ContactEncoder:
             "hand": model.hands[pad],
             "link": model.links[pad],
             "frame": model.frame_links[pad],
-            "begin_threshold_n": float(model.begin_threshold_n[pad]),
-            "end_threshold_n": float(model.end_threshold_n[pad]),
+            "begin_threshold_n": float(model.touch.begin_threshold_n[pad]),
+            "end_threshold_n": float(model.touch.end_threshold_n[pad]),
             "calibration_id": calibration.calibration_id,
             "diagnoses": calibration.diagnoses,
         }
@@ -448,6 +471,7 @@ def _read_statuses(encoder: ContactEncoder, pad: int) -> None:
     encoder.integers[_PALM_STATUS] = encoder.palm_status[pad] if in_frames else _NOT_COMPUTED
     encoder.integers[_BASE_STATUS] = encoder.base_status[pad] if in_frames else _NOT_COMPUTED
     encoder.integers[_VECTOR_STATUS] = encoder.vector_status[pad]
+    encoder.integers[_RADIUS_STATUS] = encoder.radius_status[pad]
     encoder.conditions[_ALWAYS], encoder.conditions[_FRAMES] = True, in_frames
     encoder.conditions[_LOCATED] = _is_located(encoder.contacts, pad)
     encoder.conditions[_STD] = force in (_FORCE_VALID, _FORCE_UNRELIABLE)

@@ -8,6 +8,9 @@ are those of Linux on 64-bit little-endian processors.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 _HEADER, _FRAME, _CONTROL, _ROUTE = 8, 9, 4, 2
 HEADER_WORDS, FRAME_WORDS, CONTROL_WORDS, ROUTE_WORDS = _HEADER, _FRAME, _CONTROL, _ROUTE
 """Words of a `struct mmsghdr`, of the longest frame (`struct canfd_frame`), of a control message with a
@@ -30,7 +33,7 @@ _LOW_HALF = 0xFFFFFFFF
 
 
 class SampleMemory:
-    """Memory of a slab; a row a slot.
+    """Memory of a slab, `arrays` by their names; a row a slot.
 
     words: (slots WORDS_OF_SLOT,) PDOs. arrival_ns, repeat_counts, contrary_counts: (slots,). fresh: (slots,).
     single, contrary: (slots,), 1 where a sample is one PDO, and where two differed in this cycle.
@@ -40,26 +43,13 @@ class SampleMemory:
     sign bit, 0 without sign.
     """
 
-    def __init__(
-        self,
-        words: memoryview[int],
-        arrival_ns: memoryview[int],
-        repeat_counts: memoryview[int],
-        contrary_counts: memoryview[int],
-        fresh: memoryview[int],
-        single: memoryview[int],
-        contrary: memoryview[int],
-        counts: memoryview[int],
-        fields: memoryview[int],
-        low_limits: memoryview[int],
-        high_limits: memoryview[int],
-    ) -> None:
-        self.counts, self.fields = counts, fields
-        self.channels = len(counts) // max(len(arrival_ns), 1)
-        self.low_limits, self.high_limits = low_limits, high_limits
-        self.words, self.arrival_ns, self.repeat_counts = words, arrival_ns, repeat_counts
-        self.contrary_counts = contrary_counts
-        self.fresh, self.single, self.contrary = fresh, single, contrary
+    def __init__(self, arrays: Mapping[str, Any]) -> None:
+        self.words, self.arrival_ns = arrays["words"], arrays["arrival_ns"]
+        self.repeat_counts, self.contrary_counts = arrays["repeat_counts"], arrays["contrary_counts"]
+        self.fresh, self.single, self.contrary = arrays["fresh"], arrays["single"], arrays["contrary"]
+        self.counts, self.fields = arrays["counts"], arrays["fields"]
+        self.low_limits, self.high_limits = arrays["low_limits"], arrays["high_limits"]
+        self.channels = len(self.counts) // max(len(self.arrival_ns), 1)
         self.new_fresh = self.stored_bytes = 0
 
 

@@ -1,6 +1,6 @@
 """Shear pads beneath touched pads: displacement of the skin from currents, and the force vector from both.
 
-Public names: `ShearStage`, `ShearTable`, `SHEAR_NUMBERS`, `SHEAR_CHANNELS`, `REST_SAMPLES`. The equations are
+Public names: `ShearForces`, `ShearTable`, `SHEAR_ROW`, `REST_SAMPLES`. The equations are
 those of `handtouch.field.shear` and `handtouch.field.elastic_layer`, with equal weights of the logarithms of
 all currents; derivation: docs/shear.md.
 """
@@ -8,43 +8,50 @@ all currents; derivation: docs/shear.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from handtouch.core.memory import RowArray, view_memory, view_rows
 from handtouch.core.stages.receive import SampleMemory
-from handtouch.core.stages.solve import MOUNT_COUNT, VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.rows import SHEAR_CHANNELS
+from handtouch.core.stages.solve import MOUNT_COUNT, VALUE_ROW
 from handtouch.wire.status import ForceStatus, PadState, PositionStatus
 
-_CHANNELS, _UNKNOWNS, _POINT = 4, 3, 6
-SHEAR_CHANNELS = _CHANNELS
-"""Electrodes of a shear pad: x0, xa, y0, yb."""
-_FILM, _OVERLAP, _LOST, _RADIUS, _INSET, _TRAVEL, _NOISE, _LOAD = 0, 1, 2, 3, 4, 5, 6, 7
-_STIFFNESS, _STIFFNESS_STD, _AXIS_STD, _HYSTERESIS, _ZERO_STD, _CENTRE = 8, 10, 11, 12, 13, 14
-_LOG_GAIN, _LEAN, _ALONG, _ALPHA, _NUMBERS = 16, 20, 28, 31, 32
-SHEAR_NUMBERS = {
-    "film_m": slice(_FILM, _FILM + 1),
-    "overlap_m": slice(_OVERLAP, _OVERLAP + 1),  # of bars at rest
-    "lost_m": slice(_LOST, _LOST + 1),  # by which the gap beside an edge changes this
-    "radius_m": slice(_RADIUS, _RADIUS + 1),  # of discs with their edge excess
-    "inset_m": slice(_INSET, _INSET + 1),  # of the sides of their sectors
-    "travel_m": slice(_TRAVEL, _TRAVEL + 1),
-    "noise_counts": slice(_NOISE, _NOISE + 1),
-    "load_n": slice(_LOAD, _LOAD + 1),  # normal force that is the film's reference pressure
-    "stiffness_n_per_m": slice(_STIFFNESS, _STIFFNESS + 2),
-    "stiffness_std": slice(_STIFFNESS_STD, _STIFFNESS_STD + 1),
-    "axis_std": slice(_AXIS_STD, _AXIS_STD + 1),
-    "hysteresis": slice(_HYSTERESIS, _HYSTERESIS + 1),
-    "zero_std_n": slice(_ZERO_STD, _ZERO_STD + 1),
-    "centre_m": slice(_CENTRE, _CENTRE + 2),  # of the plate, as arc lengths on the pad
-    "log_gain": slice(_LOG_GAIN, _LOG_GAIN + 4),  # of channels: current per count
-    "lean_per_m": slice(_LEAN, _LEAN + 8),  # d(pressure over its mean) / d(centre) of channels
-    "along": slice(_ALONG, _ALONG + 3),  # the pad's x in the link's frame
-    "alpha": slice(_ALPHA, _ALPHA + 1),  # exponent of the film's conductance over pressure
-}
-"""Layout of the numbers of a `ShearTable`."""
-_VALUES, _PAD_M, _FORCE = VALUE_COUNT, VALUE_SLICES["pad_m"].start, VALUE_SLICES["force_n"].start
-_FORCE_STD, _COVARIANCE = VALUE_SLICES["force_std_n"].start, VALUE_SLICES["covariance_m2"].start
-_NORMAL = VALUE_SLICES["normal"].start
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike, NDArray
+
+    from handtouch.core.slab import Slab
+    from handtouch.core.state import TickState
+
+    FloatArray = NDArray[np.float64]
+
+_CHANNELS, _UNKNOWNS, _POINT = SHEAR_CHANNELS, 3, 6
+SHEAR_ROW = np.dtype(
+    [
+        ("film_m", "<f8"),
+        ("overlap_m", "<f8"),  # of bars at rest
+        ("lost_m", "<f8"),  # by which the gap beside an edge changes this
+        ("radius_m", "<f8"),  # of discs with their edge excess
+        ("inset_m", "<f8"),  # of the sides of their sectors
+        ("travel_m", "<f8"),
+        ("noise_counts", "<f8"),
+        ("load_n", "<f8"),  # normal force that is the film's reference pressure
+        ("stiffness_n_per_m", "<f8", 2),
+        ("stiffness_std", "<f8"),
+        ("axis_std", "<f8"),
+        ("hysteresis", "<f8"),
+        ("zero_std_n", "<f8"),
+        ("centre_m", "<f8", 2),  # of the plate, as arc lengths on the pad
+        ("log_gain", "<f8", 4),  # of channels: current per count
+        ("lean_per_m", "<f8", 8),  # d(pressure over its mean) / d(centre) of channels
+        ("along", "<f8", 3),  # the pad's x in the link's frame
+        ("alpha", "<f8"),  # exponent of the film's conductance over pressure
+    ]
+)
+"""A shear pad"""
 _MOUNT_COUNT, _MOUNT_TURNING = MOUNT_COUNT, 4  # variance of the mount's rotation about each axis [rad^2]
 _VECTOR = 12  # force and its covariance
 _CLEAR = int(PadState.CLEAR)
@@ -67,100 +74,144 @@ class ShearTable:
     """Shear pad beneath a pad: its pattern, film and layer.
 
     column: of its first channel in the slab. unknowns: 2 for a displacement, 3 with a twist. points: (m 6,)
-    of the edges of bars, channel, share, direction and position [m], none of a pattern of discs. numbers: as
-    in SHEAR_NUMBERS.
+    of the edges of bars, channel, share, direction and position [m], none of a pattern of discs. row: (1,) as
+    SHEAR_ROW.
     """
 
-    def __init__(
-        self, pad: int, column: int, unknowns: int, points: memoryview[float], numbers: memoryview[float]
-    ) -> None:
+    def __init__(self, pad: int, column: int, unknowns: int, points: FloatArray, row: RowArray) -> None:
         self.pad, self.column, self.unknowns = pad, column, unknowns
-        self.points, self.numbers, self.point_count = points, numbers, len(points) // _POINT
+        self.points, self.row, self.point_count = view_memory(points), row, len(points)
 
 
-class ShearStage:
-    """Shear pads of a model. arrays: flat memory of the arrays of `TickState` by their names.
+class ShearForces:
+    """Force vectors of n pads, in a tick's state: those of contacts above shear pads, 0 to n of them.
 
-    position_status, force_status: (n,) of the pads' contacts. mounts: (n MOUNT_COUNT,) as of the
-    `ContactSolver`. work: (55,), working memory.
+    position_status, force_status: (n,) of the contacts, read in place. mounts: (n, MOUNT_COUNT), as
+    `PadModel.mounts`. `any_configured`: there is a shear pad.
     """
 
     def __init__(
         self,
-        tables: list[ShearTable],
-        pads: int,
-        arrays: Mapping[str, Any],
-        position_status: memoryview[int],
-        force_status: memoryview[int],
-        mounts: memoryview[float],
-        work: memoryview[float],
+        tables: Sequence[ShearTable],
+        state: TickState,
+        position_status: NDArray[np.uint8],
+        force_status: NDArray[np.uint8],
+        mounts: FloatArray,
     ) -> None:
-        self.tables, self.pads, self.mounts = tables, pads, mounts
-        self.position_status, self.force_status = position_status, force_status
+        self.state, self.tables, self.any_configured = state, list(tables), bool(tables)
+        self.numbers = {table.pad: number for number, table in enumerate(self.tables)}
+        self.mounts = view_memory(mounts)
+        self.position_status, self.force_status = view_memory(position_status), view_memory(force_status)
+        arrays = state.memory
         self.ticks, self.update_interval_ticks = arrays["ticks"], arrays["update_interval_ticks"]
         self.pad_state, self.sample_ns = arrays["pad_state"], arrays["sample_ns"]
         self.touching, self.held, self.unverified = arrays["touching"], arrays["held"], arrays["unverified"]
-        self.contact_id, self.values = arrays["contact_id"], arrays["values"]
+        self.contact_id, self.values = arrays["contact_id"], view_rows(state.values, VALUE_ROW)
         self.position_requested = arrays["position_requested"]
         self.force_requested = arrays["force_requested"]
         self.read_ns, self.rest_m = arrays["shear_sample_ns"], arrays["shear_rest_m"]
         self.rest_sum, self.rest_samples = arrays["shear_rest_sum"], arrays["shear_rest_samples"]
         self.peak_n = arrays["shear_peak_n"]
         self.vector, self.status = arrays["force_vector"], arrays["force_vector_status"]
-        self.counts, self.logs, self.off = work[0:4], work[4:8], work[8:12]
-        self.log_area, self.slope, self.gain = work[12:16], work[16:28], work[28:40]
-        self.motion, self.way, self.axes = work[40:43], work[43:46], work[46:55]
+        self.counts, self.logs, self.off, self.log_area = (view_memory(np.zeros(4)) for _ in range(4))
+        self.slope, self.gain = view_memory(np.zeros(12)), view_memory(np.zeros(12))
+        self.motion, self.way, self.axes = (view_memory(np.zeros(count)) for count in (3, 3, 9))
         self.misfit = 0.0
 
-    def update_forces(self, memory: SampleMemory) -> None:
-        """Compute the force vectors of contacts with a new sample, and rest positions of untouched pads."""
-        for number in range(len(self.tables)):
-            table = self.tables[number]
-            pad = table.pad
-            if self.contact_id[pad] == 0:
-                discard_vector(self, pad)
-            if self.sample_ns[pad] == self.read_ns[pad]:
-                continue
-            self.read_ns[pad] = self.sample_ns[pad]
-            if self.touching[pad]:
-                _update_force(self, memory, table)
-            elif self.pad_state[pad] == _CLEAR and not (self.held[pad] or self.unverified[pad]):
-                _measure_rest(self, memory, table)
+    def has_shear(self, pad: int) -> bool:
+        """Return True if there is a shear pad beneath a pad."""
+        return pad in self.numbers
 
-    def set_rest(self, number: int, counts: memoryview[float]) -> None:
-        """Set the rest position of the shear pad of this number by its counts (4,) at rest: a tare."""
-        table = self.tables[number]
+    def rest_known(self, pad: int) -> bool:
+        """Return True if the rest position of the shear pad beneath a pad is known."""
+        return bool(np.isfinite(self.state.shear_rest_m[pad]).all())
+
+    def update_forces(self, slab: Slab) -> None:
+        """Compute the force vectors of contacts with a new sample, and rest positions of untouched pads, once
+        position and force of a tick's contacts are known."""
+        _update_pads(self, slab.memory)
+
+    def set_rest(self, pad: int, counts: ArrayLike) -> None:
+        """Set the rest position of the shear pad beneath a pad by its counts (4,) at rest: a tare."""
+        _set_rest(self, self.tables[self.numbers[pad]], view_memory(np.array(counts, np.float64)))
+
+    def forget_rest(self, pads: Sequence[int]) -> None:
+        """Forget the rest positions of pads that were replaced; untouched samples give new ones."""
+        for pad in pads:
+            _forget_rest(self, pad)
+
+    def discard(self, pads: NDArray[np.intp]) -> None:
+        """Discard the force vectors of pads whose contact ended, or whose model changed."""
+        held = self.state
+        held.force_vector[pads], held.force_vector_status[pads] = np.nan, 0
+
+    def hand_columns(self, rows: slice) -> dict[str, bytes]:
+        """Return columns of a hand frame; empty for a hand without shear pads."""
+        if not any(rows.start <= pad < rows.stop for pad in self.numbers):
+            return {}
+        held = self.state
+        values = held.force_vector[rows].astype("<f4")
+        columns = {
+            "force_vector_status": held.force_vector_status[rows].tobytes(),
+            "force_vector_n": values[:, :3].tobytes(),
+            "force_vector_covariance_n2": values[:, 3:].tobytes(),
+        }
+        in_frames = held.frame_force_vector[rows].astype("<f4").reshape(-1, 2, 3)
+        for number, (frame, requested) in enumerate(
+            (("palm", held.palm_requested), ("base", held.base_requested))
+        ):
+            if np.count_nonzero(requested[rows]):
+                columns[f"{frame}_force_vector_n"] = in_frames[:, number].tobytes()
+        return columns
+
+
+def _update_pads(stage: ShearForces, memory: SampleMemory) -> None:
+    for number in range(len(stage.tables)):
+        table = stage.tables[number]
         pad = table.pad
-        for i in range(_CHANNELS):
-            self.counts[i] = counts[i]
-        rests = _estimate(self, table, 0.0, 0.0, 0.0)
-        for k in range(_UNKNOWNS):
-            self.rest_m[_UNKNOWNS * pad + k] = self.motion[k] if rests else _NAN
-        self.peak_n[pad] = 0.0
-        _forget_samples(self, pad)
-
-    def forget_rest(self, pad: int) -> None:
-        """Forget a pad's rest position, because the pad was replaced."""
-        for k in range(_UNKNOWNS):
-            self.rest_m[_UNKNOWNS * pad + k] = _NAN
-        self.peak_n[pad] = 0.0
-        _forget_samples(self, pad)
+        if stage.contact_id[pad] == 0:
+            _discard_vector(stage, pad)
+        if stage.sample_ns[pad] == stage.read_ns[pad]:
+            continue
+        stage.read_ns[pad] = stage.sample_ns[pad]
+        if stage.touching[pad]:
+            _update_force(stage, memory, table)
+        elif stage.pad_state[pad] == _CLEAR and not (stage.held[pad] or stage.unverified[pad]):
+            _measure_rest(stage, memory, table)
 
 
-def discard_vector(stage: ShearStage, pad: int) -> None:
+def _set_rest(stage: ShearForces, table: ShearTable, counts: memoryview[float]) -> None:
+    pad = table.pad
+    for i in range(_CHANNELS):
+        stage.counts[i] = counts[i]
+    rests = _estimate(stage, table, 0.0, 0.0, 0.0)
+    for k in range(_UNKNOWNS):
+        stage.rest_m[_UNKNOWNS * pad + k] = stage.motion[k] if rests else _NAN
+    stage.peak_n[pad] = 0.0
+    _forget_samples(stage, pad)
+
+
+def _forget_rest(stage: ShearForces, pad: int) -> None:
+    for k in range(_UNKNOWNS):
+        stage.rest_m[_UNKNOWNS * pad + k] = _NAN
+    stage.peak_n[pad] = 0.0
+    _forget_samples(stage, pad)
+
+
+def _discard_vector(stage: ShearForces, pad: int) -> None:
     """Discard the force vector of a pad without contact."""
     stage.status[pad] = _NOT_COMPUTED
     for i in range(_VECTOR):
         stage.vector[_VECTOR * pad + i] = _NAN
 
 
-def _forget_samples(stage: ShearStage, pad: int) -> None:
+def _forget_samples(stage: ShearForces, pad: int) -> None:
     stage.rest_samples[pad] = 0
     for i in range(_CHANNELS):
         stage.rest_sum[_CHANNELS * pad + i] = 0.0
 
 
-def _read_counts(stage: ShearStage, memory: SampleMemory, table: ShearTable) -> bool:
+def _read_counts(stage: ShearForces, memory: SampleMemory, table: ShearTable) -> bool:
     """Read the counts of a shear pad; return False if one is at the end of its range, or not positive."""
     first, valid = table.pad * memory.channels + table.column, True
     for i in range(_CHANNELS):
@@ -171,7 +222,7 @@ def _read_counts(stage: ShearStage, memory: SampleMemory, table: ShearTable) -> 
     return valid
 
 
-def _measure_rest(stage: ShearStage, memory: SampleMemory, table: ShearTable) -> None:
+def _measure_rest(stage: ShearForces, memory: SampleMemory, table: ShearTable) -> None:
     """Measure the rest position of an untouched pad that has none, from the mean of its samples."""
     pad = table.pad
     rest = stage.rest_m[_UNKNOWNS * pad]
@@ -191,13 +242,12 @@ def _measure_rest(stage: ShearStage, memory: SampleMemory, table: ShearTable) ->
     _forget_samples(stage, pad)
 
 
-def _update_force(stage: ShearStage, memory: SampleMemory, table: ShearTable) -> None:
+def _update_force(stage: ShearForces, memory: SampleMemory, table: ShearTable) -> None:
     """Compute tangential and whole force of a contact; note the greatest tangential force since the tare."""
-    pad, numbers = table.pad, table.numbers
-    row = pad * _VALUES
-    normal_n = stage.values[row + _FORCE]
-    x = stage.values[row + _PAD_M] - numbers[_CENTRE]
-    y = stage.values[row + _PAD_M + 1] - numbers[_CENTRE + 1]
+    pad = table.pad
+    normal_n = stage.values[pad].force_n
+    x = stage.values[pad].pad_m[0] - table.row[0].centre_m[0]
+    y = stage.values[pad].pad_m[1] - table.row[0].centre_m[1]
     located = -_INFINITY < x + y + normal_n < _INFINITY
     read = _read_counts(stage, memory, table)
     if read:
@@ -206,15 +256,15 @@ def _update_force(stage: ShearStage, memory: SampleMemory, table: ShearTable) ->
             if located
             else _estimate(stage, table, 0.0, 0.0, 0.0)
         )
-    fx = numbers[_STIFFNESS] * (stage.motion[0] - stage.rest_m[_UNKNOWNS * pad])
-    fy = numbers[_STIFFNESS + 1] * (stage.motion[1] - stage.rest_m[_UNKNOWNS * pad + 1])
+    fx = table.row[0].stiffness_n_per_m[0] * (stage.motion[0] - stage.rest_m[_UNKNOWNS * pad])
+    fy = table.row[0].stiffness_n_per_m[1] * (stage.motion[1] - stage.rest_m[_UNKNOWNS * pad + 1])
     known = read and fx + fy == fx + fy
     if known:
         stage.peak_n[pad] = max(stage.peak_n[pad], math.sqrt(fx * fx + fy * fy))
     due = stage.ticks[0] % stage.update_interval_ticks[pad] == 0
     if not due and stage.status[pad] != _NOT_COMPUTED:
         return
-    discard_vector(stage, pad)
+    _discard_vector(stage, pad)
     if not (stage.position_requested[pad] and stage.force_requested[pad]):
         return
     position, force = stage.position_status[pad], stage.force_status[pad]
@@ -230,34 +280,34 @@ def _update_force(stage: ShearStage, memory: SampleMemory, table: ShearTable) ->
     _write_vector(stage, table, fx, fy, normal_n)
 
 
-def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, normal_n: float) -> None:
+def _write_vector(stage: ShearForces, table: ShearTable, fx: float, fy: float, normal_n: float) -> None:
     """Write force on the pad and covariance in the link's frame, after `_estimate` and `_set_axes`."""
-    pad, numbers, gain = table.pad, table.numbers, stage.gain
-    row, first = pad * _VALUES, pad * _VECTOR
+    pad, gain = table.pad, stage.gain
+    first = pad * _VECTOR
     xx = xy = yy = 0.0  # covariance of the displacement: noise of channels
     for i in range(_CHANNELS):
-        noise = numbers[_NOISE] / stage.counts[i]
+        noise = table.row[0].noise_counts / stage.counts[i]
         variance = noise * noise
         xx += gain[i] * gain[i] * variance
         xy += gain[i] * gain[_CHANNELS + i] * variance
         yy += gain[_CHANNELS + i] * gain[_CHANNELS + i] * variance
     # and the centre and size of the normal force
-    at = row + _COVARIANCE
-    std = stage.values[row + _FORCE_STD]
+    std = stage.values[pad].force_std_n
     zz = std * std
-    variance = 0.5 * (stage.values[at] + stage.values[at + 4] + stage.values[at + 8])
-    x = stage.values[row + _PAD_M] - numbers[_CENTRE]
-    y = stage.values[row + _PAD_M + 1] - numbers[_CENTRE + 1]
-    load = max(normal_n, 0.0) / numbers[_LOAD]
+    variance = stage.values[pad].covariance_m2[0] + stage.values[pad].covariance_m2[4]
+    variance = 0.5 * (variance + stage.values[pad].covariance_m2[8])
+    x = stage.values[pad].pad_m[0] - table.row[0].centre_m[0]
+    y = stage.values[pad].pad_m[1] - table.row[0].centre_m[1]
+    load = max(normal_n, 0.0) / table.row[0].load_n
     for axis in range(3):
         by_x = by_y = 0.0
         for i in range(_CHANNELS):
-            lean = _pressure_ratio(numbers, i, x, y)
-            slope = numbers[_ALPHA] / (1.0 + load * lean)
+            lean = _pressure_ratio(table, i, x, y)
+            slope = table.row[0].alpha / (1.0 + load * lean)
             if axis == 2:
-                slope *= lean / numbers[_LOAD]
+                slope *= lean / table.row[0].load_n
             else:
-                slope *= load * numbers[_LEAN + 2 * i + axis] if lean > 0.0 else 0.0
+                slope *= load * table.row[0].lean_per_m[2 * i + axis] if lean > 0.0 else 0.0
             by_x += gain[i] * slope
             by_y += gain[_CHANNELS + i] * slope
         if axis == 2:
@@ -265,11 +315,11 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
         xx += by_x * by_x * variance
         xy += by_x * by_y * variance
         yy += by_y * by_y * variance
-    kx, ky = numbers[_STIFFNESS], numbers[_STIFFNESS + 1]
-    common = numbers[_STIFFNESS_STD] * numbers[_STIFFNESS_STD]
-    axis_variance = numbers[_AXIS_STD] * numbers[_AXIS_STD]
-    loop = numbers[_HYSTERESIS] * (stage.peak_n[pad] - 0.5 * math.sqrt(fx * fx + fy * fy))
-    even = numbers[_ZERO_STD] * numbers[_ZERO_STD] + loop * loop / 3.0
+    kx, ky = table.row[0].stiffness_n_per_m[0], table.row[0].stiffness_n_per_m[1]
+    common = table.row[0].stiffness_std * table.row[0].stiffness_std
+    axis_variance = table.row[0].axis_std * table.row[0].axis_std
+    loop = table.row[0].hysteresis * (stage.peak_n[pad] - 0.5 * math.sqrt(fx * fx + fy * fy))
+    even = table.row[0].zero_std_n * table.row[0].zero_std_n + loop * loop / 3.0
     xx = kx * kx * xx + (common + axis_variance) * fx * fx + even
     xy = kx * ky * xy + common * fx * fy
     yy = ky * ky * yy + (common + axis_variance) * fy * fy + even
@@ -288,15 +338,16 @@ def _write_vector(stage: ShearStage, table: ShearTable, fx: float, fy: float, no
             vector[first + 3 + 3 * i + j] = value if zz < _INFINITY else _NAN
 
 
-def _set_axes(stage: ShearStage, table: ShearTable) -> bool:
+def _set_axes(stage: ShearForces, table: ShearTable) -> bool:
     """Set the axes of the surface at the contact, in the link's frame: x along the pad's, y, and the normal.
 
     The columns of a matrix, so that it turns forces in the tangent plane to the link's frame. Return False
     where the normal is along the pad's x.
     """
-    axes, numbers, at = stage.axes, table.numbers, table.pad * _VALUES + _NORMAL
-    nx, ny, nz = stage.values[at], stage.values[at + 1], stage.values[at + 2]
-    ax, ay, az = numbers[_ALONG], numbers[_ALONG + 1], numbers[_ALONG + 2]
+    axes, pad = stage.axes, table.pad
+    nx, ny = stage.values[pad].normal[0], stage.values[pad].normal[1]
+    nz = stage.values[pad].normal[2]
+    ax, ay, az = table.row[0].along[0], table.row[0].along[1], table.row[0].along[2]
     part = ax * nx + ay * ny + az * nz
     ax, ay, az = ax - part * nx, ay - part * ny, az - part * nz
     length = math.sqrt(ax * ax + ay * ay + az * az)
@@ -309,25 +360,25 @@ def _set_axes(stage: ShearStage, table: ShearTable) -> bool:
     return True
 
 
-def _pressure_ratio(numbers: memoryview[float], channel: int, x: float, y: float) -> float:
+def _pressure_ratio(table: ShearTable, channel: int, x: float, y: float) -> float:
     """Return the pressure at a channel over its mean, of a force at (x, y) from the plate's centre."""
-    first = _LEAN + 2 * channel
-    return max(1.0 + numbers[first] * x + numbers[first + 1] * y, 0.0)
+    ratio: float = 1.0 + table.row[0].lean_per_m[2 * channel] * x
+    ratio += table.row[0].lean_per_m[2 * channel + 1] * y
+    return max(ratio, 0.0)
 
 
-def _estimate(stage: ShearStage, table: ShearTable, normal_n: float, x: float, y: float) -> bool:
+def _estimate(stage: ShearForces, table: ShearTable, normal_n: float, x: float, y: float) -> bool:
     """Compute motion, its derivatives by the logarithms of the currents, and misfit, by Gauss-Newton steps.
 
     normal_n, x, y: force on the pad and its centre from the plate's. Return False where no displacement
     within the travel has such currents.
     """
-    numbers = table.numbers
-    travel, load = numbers[_TRAVEL], normal_n / numbers[_LOAD]
+    travel, load = table.row[0].travel_m, normal_n / table.row[0].load_n
     for i in range(_CHANNELS):
         if not stage.counts[i] > 0.0:
             return False
-        tilt = numbers[_ALPHA] * math.log(1.0 + load * _pressure_ratio(numbers, i, x, y))
-        stage.logs[i] = math.log(stage.counts[i]) + numbers[_LOG_GAIN + i] - tilt
+        tilt = table.row[0].alpha * math.log(1.0 + load * _pressure_ratio(table, i, x, y))
+        stage.logs[i] = math.log(stage.counts[i]) + table.row[0].log_gain[i] - tilt
     for k in range(_UNKNOWNS):
         stage.motion[k] = 0.0
     for _ in range(_MAX_STEPS):
@@ -348,10 +399,11 @@ def _estimate(stage: ShearStage, table: ShearTable, normal_n: float, x: float, y
             stage.motion[k] += damp * stage.way[k]
         if size <= _STEP_TOLERANCE * travel:
             break
-    return stage.motion[0] * stage.motion[0] + stage.motion[1] * stage.motion[1] < travel * travel
+    within: bool = stage.motion[0] * stage.motion[0] + stage.motion[1] * stage.motion[1] < travel * travel
+    return within
 
 
-def _invert_slopes(stage: ShearStage, unknowns: int) -> bool:
+def _invert_slopes(stage: ShearForces, unknowns: int) -> bool:
     """Compute the gain (unknowns, 4) of the motion over the logarithms of the currents, by least squares.
 
     Write what these are off, without the common part that is the film's conductance, and the misfit.
@@ -394,9 +446,9 @@ def _dot(left: memoryview[float], row: int, right: memoryview[float], other: int
     return total
 
 
-def _evaluate_bars(stage: ShearStage, table: ShearTable) -> bool:
+def _evaluate_bars(stage: ShearForces, table: ShearTable) -> bool:
     """Compute logarithms of the areas of bars, and their slopes (3, 4), at the present motion."""
-    numbers, points, area, slope = table.numbers, table.points, stage.log_area, stage.slope
+    points, area, slope = table.points, stage.log_area, stage.slope
     for i in range(_CHANNELS):
         area[i] = 0.0
         for k in range(_UNKNOWNS):
@@ -406,15 +458,15 @@ def _evaluate_bars(stage: ShearStage, table: ShearTable) -> bool:
         first = _POINT * point
         i, share = int(points[first]), points[first + 1]
         wx, wy, px, py = points[first + 2], points[first + 3], points[first + 4], points[first + 5]
-        qx, qy = px + wx * numbers[_OVERLAP], py + wy * numbers[_OVERLAP]
+        qx, qy = px + wx * table.row[0].overlap_m, py + wy * table.row[0].overlap_m
         rx, ry = cosine * qx - sine * qy, sine * qx + cosine * qy
         along = wx * (rx + stage.motion[0] - px) + wy * (ry + stage.motion[1] - py)
-        s = (along + numbers[_LOST]) / numbers[_FILM]
+        s = (along + table.row[0].lost_m) / table.row[0].film_m
         if not -_MAX_EXPONENT < _PI * s < _MAX_EXPONENT:
             return False
         wide = math.exp(_PI * s)
         upper = _agm(math.sqrt(wide / (1.0 + wide)))
-        rate = share * upper * upper / numbers[_FILM]
+        rate = share * upper * upper / table.row[0].film_m
         area[i] += share * upper / _agm(math.sqrt(1.0 / (1.0 + wide)))
         slope[i] += rate * wx
         slope[_CHANNELS + i] += rate * wy
@@ -440,10 +492,9 @@ def _agm(low: float) -> float:
     return 0.5 * (high + low)
 
 
-def _evaluate_discs(stage: ShearStage, table: ShearTable) -> bool:
+def _evaluate_discs(stage: ShearForces, table: ShearTable) -> bool:
     """Compute logarithms of the areas of discs over their sectors, and slopes, at the present motion."""
-    numbers = table.numbers
-    radius, inset = numbers[_RADIUS], numbers[_INSET]
+    radius, inset = table.row[0].radius_m, table.row[0].inset_m
     p = _ROOT_HALF * (stage.motion[0] + stage.motion[1])
     q = _ROOT_HALF * (stage.motion[1] - stage.motion[0])
     for i in range(_CHANNELS):  # x0, xa, y0, yb, along the diagonals

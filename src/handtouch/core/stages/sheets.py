@@ -1,97 +1,85 @@
 """Compensation of sheet behaviour in the forces of a tick: one row of the sheets' state a pad.
 
-Public names: `SheetStage`, `SheetInterval`. The equations are those of
+Public names: `SheetStage`. The equations are those of
 `handtouch.sheet.SheetCompensator`, with the back force held between its updates.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
+from handtouch.core.memory import RowArray, view_rows
+from handtouch.core.stages import loads
 from handtouch.core.stages.force import BOUNDED
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.loads import SheetInterval, SheetLoads
+from handtouch.core.stages.solve import VALUE_ROW
 
-_VALUES = VALUE_COUNT
-_FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
-_FORCE_STATUS = VALUE_SLICES["force_status"].start
+if TYPE_CHECKING:
+    from handtouch.core.state import TickState
+
+UPDATE_PERIOD_S = 0.1
+"""Period of updates of back forces and uncertainties"""
+SHEET_LOAD_ROW = np.dtype([("load", "<f8"), ("before", "<f8"), ("effective", "<f8"), ("reading", "<f8")])
+"""Load of a sheet in a tick, that before hysteresis, the effective one, and the reading [N]"""
 _BOUNDED = float(BOUNDED)
 _INVALID = 2  # ForceReliability
 _NAN, _INFINITY = float("nan"), float("inf")
 _MAX_PAUSE_NS = 3600 * 1_000_000_000
 
 
-class SheetInterval:
-    """Sheets of one behaviour over one interval of `dt_s`: rows `first` to `stop` of the sheets' state.
+class SheetUpdates(Protocol):
+    """Computations of sheets that a tick doesn't need at once, and their intervals."""
 
-    number: of the behaviour. lines (elements elements,), transition (elements - 1, elements): of creep,
-    `elements` with the load itself; total: reading of an old load over the load. base, widths_n, weights
-    (plays,): of the inverse hysteresis.
-    """
+    def update(self, uncertainties: bool) -> None:
+        """Update back forces that are due; with `uncertainties` those of forces, too."""
 
-    def __init__(
-        self,
-        number: int,
-        first: int,
-        stop: int,
-        dt_s: float,
-        total: float,
-        base: float,
-        lines: memoryview[float],
-        transition: memoryview[float],
-        widths_n: memoryview[float],
-        weights: memoryview[float],
-        elements: int,
-    ) -> None:
-        self.number, self.first, self.stop, self.dt_s = number, first, stop, dt_s
-        self.total, self.base, self.lines, self.transition = total, base, lines, transition
-        self.widths_n, self.weights = widths_n, weights
-        self.elements, self.plays = elements, len(weights)
+    def update_began(self) -> None:
+        """Update uncertainties of contacts that began in this tick, within the tick."""
+
+    def make_steps(self, dt_s: float) -> list[SheetInterval]:
+        """Return the intervals of all behaviours of a duration."""
 
 
 class SheetStage:
-    """Sheets of n pads. arrays: flat memory of the arrays of `TickState` by their names.
+    """Sheets of n pads, whose state is in `held`; `history`: the same, for loads by readings.
 
-    pads: (n,) pad of each row of the sheets' state, of which the first `sheets` are used. gain: (n,) of each
-    pad's force. results: (4 n,) load, load before hysteresis, effective load and reading of each row.
-    update: called with True when uncertainties of forces are to be updated, with False when back forces only:
-    within a tick for contacts that began in it, else by `complete_update`.
-    make_steps: returns the intervals of all behaviours of a duration [s].
+    pads: (sheets,) pad of each used row of the sheets' state; max_force_n: (sheets,) greatest force of each
+    [N]. gain: (n,) of each pad's force. results: (n,) SHEET_LOAD_ROWs, of each row. owner: computes what
+    isn't needed at once.
     """
 
     def __init__(
         self,
-        arrays: Mapping[str, Any],
+        held: TickState,
+        history: SheetLoads,
         pads: memoryview[int],
-        sheets: int,
+        max_force_n: memoryview[float],
         gain: memoryview[float],
-        results: memoryview[float],
-        elements: int,
-        plays: int,
+        results: RowArray,
         period_ns: int,
-        update_period_s: float,
-        update: Callable[[bool], None],
-        update_began: Callable[[], None],
-        make_steps: Callable[[float], list[SheetInterval]],
+        owner: SheetUpdates,
     ) -> None:
-        self.update, self.update_began, self.make_steps = update, update_began, make_steps
-        self.periods, self.steps = -1, make_steps(0.0)
+        self.owner, self.history, arrays = owner, history, held.memory
+        self.periods = -1
         self.due = self.began = self.back_due = False
-        self.pads, self.sheets, self.gain, self.results = pads, sheets, gain, results
-        self.columns, self.play_columns = elements, plays
-        self.rows = len(pads)
-        self.period_ns, self.update_period_s = period_ns, update_period_s
-        self.touching, self.values = arrays["touching"], arrays["values"]
+        self.pads, self.sheets, self.gain, self.results = pads, len(pads), gain, results
+        self.max_force_n, self.period_ns = max_force_n, period_ns
+        self.touching, self.values = arrays["touching"], view_rows(held.values, VALUE_ROW)
         self.apparent_n = arrays["uncompensated_force_n"]
-        self.elements, self.plays = arrays["sheet_elements"], arrays["sheet_plays"]
-        self.back_n, self.flow_s = arrays["back_n"], arrays["flow_s"]
-        self.impulse_ns, self.back_waited_s = arrays["impulse_ns"], arrays["back_waited_s"]
-        self.load_is_old = arrays["load_is_old"]
-        self.growth = arrays["bank_growth"]
+        self.flow_s, self.impulse_ns = arrays["flow_s"], arrays["impulse_ns"]
+        self.back_waited_s = arrays["back_waited_s"]
         self.force_n, self.std_n = arrays["compensated_force_n"], arrays["compensated_std_n"]
         self.relative_std, self.reliability = arrays["relative_std"], arrays["force_reliability"]
         self.last_touch_ns, self.new_contact = arrays["last_touch_ns"], arrays["new_contact"]
         self.updated_ns, self.waited_s = arrays["sheets_updated_ns"], arrays["uncertainty_waited_s"]
+        self.update_period_s = UPDATE_PERIOD_S
+
+    def find_intervals(self, sync_ns: int) -> None:
+        """Set the intervals of the history to those from the sheets' state to `sync_ns`; that stays as it
+        is."""
+        _find_steps(self, _periods_to(self, sync_ns))
 
     def compensate_forces(self, sync_ns: int) -> None:
         """Advance all sheets to `sync_ns`, and compensate the forces of touched pads with a model.
@@ -100,16 +88,15 @@ class SheetStage:
         [N]; untouched pads count as 0.
         """
         periods = _elapsed_periods(self, sync_ns)
-        if periods != self.periods:
-            self.periods = periods
-            self.steps = self.make_steps(periods * self.period_ns * 1e-9)
+        _find_steps(self, periods)
         self.back_due = False
-        for k in range(len(self.steps)):
-            if _compensate_sheets(self, self.steps[k]):
+        steps = self.history.steps
+        for k in range(len(steps)):
+            if _compensate_sheets(self, steps[k]):
                 self.back_due = True
         _find_pressed(self, periods * self.period_ns * 1e-9)
         if self.began:  # its first message has an uncertainty
-            self.update_began()
+            self.owner.update_began()
         self.store_forces()
 
     def complete_update(self) -> None:
@@ -117,7 +104,7 @@ class SheetStage:
         if self.back_due or self.due:
             uncertainties = self.due
             self.back_due = self.due = False
-            self.update(uncertainties)
+            self.owner.update(uncertainties)
 
     def store_forces(self) -> None:
         """Replace the forces of touched pads in the contacts' values by compensated ones."""
@@ -125,11 +112,28 @@ class SheetStage:
             pad = self.pads[row]
             if not self.touching[pad]:
                 continue
-            force, first = self.force_n[pad], pad * _VALUES
+            force = self.force_n[pad]
             self.std_n[pad] = force * self.relative_std[pad]
-            self.values[first + _FORCE] = _NAN if self.reliability[pad] == _INVALID else force
-            saturated = self.values[first + _FORCE_STATUS] == _BOUNDED
-            self.values[first + _FORCE_STD] = _INFINITY if saturated else self.std_n[pad]
+            if force > self.max_force_n[row]:
+                force = self.max_force_n[row]
+            self.values[pad].force_n = _NAN if self.reliability[pad] == _INVALID else force
+            saturated = self.values[pad].force_status == _BOUNDED
+            self.values[pad].force_std_n = _INFINITY if saturated else self.std_n[pad]
+
+
+def _find_steps(stage: SheetStage, periods: int) -> None:
+    """Set the intervals of the history to those of so many periods."""
+    if periods != stage.periods:
+        stage.periods = periods
+        stage.history.steps = stage.owner.make_steps(periods * stage.period_ns * 1e-9)
+
+
+def _periods_to(stage: SheetStage, sync_ns: int) -> int:
+    """Return the whole periods since the last tick; 0 after a pause, or with another clock."""
+    elapsed_ns: int = sync_ns - stage.updated_ns[0]
+    if elapsed_ns > _MAX_PAUSE_NS or elapsed_ns < 0:
+        return 0
+    return (elapsed_ns + stage.period_ns // 2) // stage.period_ns
 
 
 def _elapsed_periods(stage: SheetStage, sync_ns: int) -> int:
@@ -138,17 +142,16 @@ def _elapsed_periods(stage: SheetStage, sync_ns: int) -> int:
     if elapsed_ns > _MAX_PAUSE_NS or elapsed_ns < 0:
         stage.updated_ns[0] = sync_ns
         return 0
-    periods = (elapsed_ns + stage.period_ns // 2) // stage.period_ns
+    periods = _periods_to(stage, sync_ns)
     stage.updated_ns[0] += periods * stage.period_ns
     return periods
 
 
 def _compensate_sheets(stage: SheetStage, step: SheetInterval) -> bool:
     """Compute loads of sheets of one behaviour; return True if their back forces are to be updated."""
-    old = stage.load_is_old[step.number] != 0
     for row in range(step.first, step.stop):
-        _compensate_sheet(stage, step, row, old)
-    stage.load_is_old[step.number] = 0
+        _compensate_sheet(stage, step, row)
+    stage.history.load_is_old[step.number] = 0
     waited_s: float = stage.back_waited_s[step.number] + step.dt_s
     stage.back_waited_s[step.number] = waited_s
     return waited_s >= stage.update_period_s
@@ -178,80 +181,53 @@ def _find_pressed(stage: SheetStage, dt_s: float) -> None:
             stage.waited_s[0] = 0.0
 
 
-def _compensate_sheet(stage: SheetStage, step: SheetInterval, row: int, old: bool) -> None:
+def _compensate_sheet(stage: SheetStage, step: SheetInterval, row: int) -> None:
     """Compute the load of one sheet; NaN where the apparent load isn't finite: the last one then goes on."""
-    pad, first, last = stage.pads[row], row * stage.columns, row * stage.play_columns
+    history, pad = stage.history, stage.pads[row]
+    first, last = row * history.columns, row * history.play_columns
     apparent = stage.apparent_n[pad] if stage.touching[pad] else 0.0
     finite = -_INFINITY < apparent < _INFINITY
     if apparent <= 0.0:  # a release is immediate, and leaves no trace
         for i in range(step.elements):
-            stage.elements[first + i] = 0.0
+            history.elements[first + i] = 0.0
         for i in range(step.plays):
-            stage.plays[last + i] = 0.0
+            history.plays[last + i] = 0.0
         _write_result(stage, row, 0.0, 0.0, 0.0, 0.0)
         stage.force_n[pad] = 0.0
         return
-    if not finite:
-        effective = stage.elements[first]
-        apparent = effective * step.total
-    elif old:
-        effective = apparent / step.total
+    if finite:
+        effective = loads.invert_creep(history, step, row, apparent)
     else:
-        effective = _invert_creep(stage, step, first, apparent)
-    _advance_creep(stage, step, first, effective, old)
-    effective /= stage.growth[row]
-    before = effective + stage.back_n[row] if effective > 0.0 else 0.0
+        effective = history.elements[first]
+        apparent = effective * step.total
+    _advance_creep(history, step, first, effective)
+    effective /= history.growth[row]
+    before = loads.load_before_hysteresis(history, row, effective)
     if effective > 0.0:
         stage.impulse_ns[row] += step.dt_s * before
         stage.flow_s[row] += step.dt_s
-    load = before
-    if step.plays > 0:
-        load = _invert_hysteresis(stage, step, last, before)
+    load = loads.invert_hysteresis(history, step, row, before)
+    for i in range(step.plays):
+        history.plays[last + i] = loads.moved_play(history.plays[last + i], before, step.widths_n[i])
     _write_result(stage, row, load, before, effective, apparent)
     stage.force_n[pad] = load if finite else _NAN
 
 
-def _invert_creep(stage: SheetStage, step: SheetInterval, first: int, reading: float) -> float:
-    """Return the load of a reading: the largest solution of its straight lines."""
-    n, greatest = step.elements, 0.0
-    stage.elements[first] = reading
-    for k in range(n):
-        load = 0.0
-        for i in range(n):
-            load += step.lines[k * n + i] * stage.elements[first + i]
-        if k == 0 or load > greatest:
-            greatest = load
-    return greatest
-
-
-def _advance_creep(stage: SheetStage, step: SheetInterval, first: int, load: float, old: bool) -> None:
+def _advance_creep(history: SheetLoads, step: SheetInterval, first: int, load: float) -> None:
     """Advance the elements under a load; none exceeds it."""
-    n = step.elements
-    stage.elements[first] = load
+    n, old = step.elements, history.load_is_old[step.number] != 0
+    history.elements[first] = load
     # an element needs only the load and itself
     for i in range(1, n):
         moved = load
         if not old:
             at = (i - 1) * n
-            moved = step.transition[at] * load + step.transition[at + i] * stage.elements[first + i]
-        stage.elements[first + i] = moved if moved < load else load
-
-
-def _invert_hysteresis(stage: SheetStage, step: SheetInterval, last: int, before: float) -> float:
-    load = step.base * before
-    for i in range(step.plays):
-        play = stage.plays[last + i]
-        if play > before:
-            play = before
-        if play < before - step.widths_n[i]:
-            play = before - step.widths_n[i]
-        stage.plays[last + i] = play
-        load += step.weights[i] * play
-    return load
+            moved = step.transition[at] * load + step.transition[at + i] * history.elements[first + i]
+        history.elements[first + i] = moved if moved < load else load
 
 
 def _write_result(
     stage: SheetStage, row: int, load: float, before: float, effective: float, reading: float
 ) -> None:
-    stage.results[row], stage.results[stage.rows + row] = load, before
-    stage.results[2 * stage.rows + row], stage.results[3 * stage.rows + row] = effective, reading
+    stage.results[row].load, stage.results[row].before = load, before
+    stage.results[row].effective, stage.results[row].reading = effective, reading

@@ -20,84 +20,73 @@ farther than chatter does, or farther than at its speed. For alarms and odds, it
 its positions in the period of chatter before that onset; ln R itself, evidence beside that of joints, counts
 the others too.
 
-Public names: `SlipStage`, `SLIP_SLICES`, `SLIP_COUNT`, `SLIP_PARAMETERS`, `MOTION_CLASSES`.
+Public names: `SlipDetector`, `GripModel`, `SLIP_SLICES`, `MOTION_CLASSES`, `FALSE_ALARM_S`,
+`INFORMATION` (block of a row's ramps).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
+import numpy as np
 
-SLIP_PARAMETERS = (
-    "period_s", "log_threshold", "onset_stride", "log_creep_variance", "level_drift_variance",
-    "log_tremor_variance", "min_log_tremor_variance", "max_log_tremor_variance", "tremor_rate",
-    "tremor_time_constant_s", "creep_time_constant_s", "coupling_variance", "coupling_drift_variance",
-    "chatter_m", "chatter_speed", "chatter_time_s", "sway_m",
-)  # fmt: skip
-"""Names of the parameters, in order; `handtouch.core.slip.GripModel` explains them."""
-_PERIOD, _LOG_THRESHOLD, _STRIDE, _CREEP_START, _LEVEL_DRIFT, _TREMOR_START, _TREMOR_MIN = 0, 1, 2, 3, 4, 5, 6
-_TREMOR_MAX, _TREMOR_RATE, _TREMOR_TIME, _CREEP_TIME, _COUPLING, _COUPLING_DRIFT = 7, 8, 9, 10, 11, 12
-_CHATTER, _CHATTER_SPEED, _CHATTER_TIME, _SWAY = 13, 14, 15, 16
+from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
+from handtouch.core.stages.rows import SLIP_ONSETS, SLIP_RAMP_BLOCKS, SLIP_ROW
+from handtouch.core.stages.solve import VALUE_ROW
 
-_ONSETS, _RECENT, _OLDER_STRIDE = (
-    33,
-    12,
-    4,
-)  # onset hypotheses; the latest of them; every fourth of older ones
-_RAMP = 8 * _ONSETS  # of an axis: four states, and these
-_SCORE, _INFORMATION, _START, _START_NOISE = 4 * _ONSETS, 5 * _ONSETS, 6 * _ONSETS, 7 * _ONSETS
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-# a pad's row of the state
-_LABEL, _LOG_ODDS, _SLIPPING, _SLIPS, _SAMPLES, _AGE = 0, 1, 2, 3, 4, 5
-_POSITION, _VELOCITY, _VAR_PP, _VAR_PV, _VAR_VV = 6, 8, 10, 12, 14
-_FORCE, _RATE, _RATE_STD, _FIRM_CURRENT, _PEAK_CURRENT = 16, 17, 18, 19, 20
-_SLIP_START, _REST, _LOG_RATIO, _ONSET_AGE, _SLIP_VELOCITY = 21, 23, 24, 25, 26
-_FIRST_PRESS, _LAST_PRESS, _BEFORE_PRESS, _PRESS_NOISE, _TESTED, _UNTIL_ONSET, _ONSET_NUMBER, _LEARNING = (
-    28, 29, 30, 31, 32, 33, 34, 35,
-)  # fmt: skip
-_TREMOR, _GRIP_TREMOR, _LEVEL, _COVARIANCE, _AGES = 36, 38, 40, 48, 68
-_RAMPS = _AGES + _ONSETS
-_CREEP = _RAMPS + 2 * _RAMP
-_GRIP_CREEP = _CREEP + 2 * _ONSETS
-_LAST = _GRIP_CREEP + 2 * _ONSETS
-_LAST_NOISE = _LAST + 2
-_COUNT = _LAST_NOISE + 1
-SLIP_COUNT = _COUNT
-SLIP_WORK = 7 * _ONSETS
-SLIP_SLICES = {
-    "label": slice(_LABEL, _LABEL + 1),  # index of MOTION_CLASSES
-    "log_odds": slice(_LOG_ODDS, _LOG_ODDS + 1),  # ln of the odds of slip
-    "slipping": slice(_SLIPPING, _SLIPPING + 1),  # 1 while the centroid moves
-    "slips": slice(_SLIPS, _SLIPS + 1),  # of this contact so far
-    "samples": slice(_SAMPLES, _SAMPLES + 1),
-    "age_s": slice(_AGE, _AGE + 1),  # from its first sample to its last
-    "position_m": slice(_POSITION, _POSITION + 2),  # on the pad, filtered
-    "velocity_m_per_s": slice(_VELOCITY, _VELOCITY + 2),
-    "velocity_variance": slice(_VAR_VV, _VAR_VV + 2),
-    "force_n": slice(_FORCE, _FORCE + 1),  # smoothed
-    "force_rate_n_per_s": slice(_RATE, _RATE + 1),
-    "slip_start_m": slice(_SLIP_START, _SLIP_START + 2),  # position at the onset
-    "log_ratio": slice(_LOG_RATIO, _LOG_RATIO + 1),  # ln R
-    "onset_age_s": slice(_ONSET_AGE, _ONSET_AGE + 1),  # of the likeliest onset, where slip is likely
-    "slip_velocity_m_per_s": slice(_SLIP_VELOCITY, _SLIP_VELOCITY + 2),  # since that onset
-    "log_tremor_variance": slice(_TREMOR, _TREMOR + 2),  # as learnt
-    "onset_ages_s": slice(_AGES, _AGES + _ONSETS),  # 0: unused
-    "information_x": slice(_RAMPS + _INFORMATION, _RAMPS + _INFORMATION + _ONSETS),  # of a ramp of 1 m/s
-    "information_y": slice(_RAMPS + _RAMP + _INFORMATION, _RAMPS + _RAMP + _INFORMATION + _ONSETS),
-}
-"""Parts of a pad's row that others may read."""
+    from handtouch.core.state import TickState
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.intp]
+
+FALSE_ALARM_S = 600.0
+"""Lower bound on the mean time between two false alarms of one contact, under the grip model."""
+_ONSET_PERIOD_S = 0.005
+_ONSETS, _RECENT, _OLDER_STRIDE = SLIP_ONSETS, 12, 4
+"""Onset hypotheses; the latest of them; of older ones each has so many times their period"""
+_LEVEL, _TREMOR, _SPEED, _COUPLING, _SCORE, _INFORMATION, _START, _START_NOISE = range(8)
+"""States of an axis: level, tremor, its speed, coupling to the pressure; their responses to a ramp of 1 m/s
+from each onset, with its score, information, and the position at the onset with the variance of its noise"""
+INFORMATION = _INFORMATION
+_BLOCKS = SLIP_RAMP_BLOCKS
+_LEVEL_LEVEL, _LEVEL_TREMOR, _LEVEL_SPEED, _LEVEL_COUPLING, _TREMOR_TREMOR = range(5)
+_TREMOR_SPEED, _TREMOR_COUPLING, _SPEED_SPEED, _SPEED_COUPLING, _COUPLING_COUPLING = range(5, 10)
+"""Covariances of the states, those of one with itself and those after it"""
+
+SLIP_SLICES, SLIP_COUNT = slices_of(SLIP_ROW), row_count(SLIP_ROW)
+"""Place of each value in a row, and their number"""
+GRIP_ROW = np.dtype(
+    [
+        ("period_s", "<f8"),
+        ("log_threshold", "<f8"),
+        ("onset_stride", "<f8"),
+        ("log_creep_variance", "<f8"),
+        ("level_drift_variance", "<f8"),
+        ("log_tremor_variance", "<f8"),
+        ("min_log_tremor_variance", "<f8"),
+        ("max_log_tremor_variance", "<f8"),
+        ("tremor_rate", "<f8"),
+        ("tremor_time_constant_s", "<f8"),
+        ("creep_time_constant_s", "<f8"),
+        ("coupling_variance", "<f8"),
+        ("coupling_drift_variance", "<f8"),
+        ("chatter_m", "<f8"),
+        ("chatter_speed", "<f8"),
+        ("chatter_time_s", "<f8"),
+        ("sway_m", "<f8"),
+    ]
+)
+"""Parameters of the stage, see `GripModel`"""
 MOTION_CLASSES = ("sticking", "incipient", "sliding", "rolling", "lift-off")
 """Classes of motion; rolling isn't detected here, as that needs joint states."""
 _STICKING, _INCIPIENT, _SLIDING, _LIFT_OFF = 0, 1, 2, 4
 
-_VALUES, _PAD_M, _COVARIANCE_M2, _PAD_NOISE, _FORCE_N = (
-    VALUE_COUNT,
-    VALUE_SLICES["pad_m"].start,
-    VALUE_SLICES["covariance_m2"].start,
-    VALUE_SLICES["pad_noise_m2"].start,
-    VALUE_SLICES["force_n"].start,
-)
 _NO_SLIP, _INFINITY = -math.inf, math.inf
 _MIN_VARIANCE_M2 = 1e-14
 _FIRM_CURRENT_FACTOR = 10.0  # current of a firm contact over that at its begin
@@ -122,30 +111,99 @@ _MIN_ONSET_LOG_ODDS = 3.0  # ln R above which onset and velocity are computed
 _SLOW, _MEDIUM, _FAST = 1e-3 * 1e-3, 5e-3 * 5e-3, 30e-3 * 30e-3
 
 
-class SlipStage:
-    """Slip test of the contacts of n pads; arrays are flat, with a row a pad.
+@dataclass(frozen=True, slots=True)
+class GripModel:
+    """Motion of a contact that doesn't slide."""
 
-    parameters: as SLIP_PARAMETERS. work: (SLIP_WORK,). state: (n SLIP_COUNT,), the result, laid out as
-    SLIP_SLICES; contact_id: (n,) of the contacts that `state` is about, 0 for none; sample_ns: (n,) of their
-    last sample that counted. Of the tick: values (n VALUE_COUNT,), total_a (n,), times (n,) of the samples
-    [ns], ids (n,) of the contacts.
+    creep_std_m_per_s: float = 0.7e-3
+    """standard deviation of the speed at which soft contacts creep and roll; initial value, then learnt"""
+    level_drift_std_m: float = 20e-6
+    """standard deviation of the level's drift in one second"""
+    tremor_std_m: float = 30e-6
+    """standard deviation of the tremor; initial value, then learnt from the innovations"""
+    tremor_std_range_m: tuple[float, float] = (2e-6, 300e-6)
+    tremor_corner_hz: float = 5.0
+    """corner frequency of the tremor"""
+    tremor_time_constant_s: float = 1.0
+    """time constant of learning the tremor"""
+    creep_time_constant_s: float = 2.0
+    """time constant of learning the creep; shorter at the start"""
+    coupling_std_m: float = 1e-3
+    """standard deviation of the centroid's displacement per relative current of a firm contact"""
+    coupling_drift_per_s: float = 0.05
+    """relative change of that coupling in one second"""
+    chatter_m: float = 0.35e-3
+    """displacement that bursts of chatter don't reach, as it returns: those of 9 Hz and 0.1 mm amplitude that
+    bench_slip plays move a contact by 0.2 mm, noise and tremor of a light contact by some more. Chosen: on a
+    hand of the tuning family, world `default`, double misses 3 mm/s (found after 0.23 s at 0.5 N) and finds
+    10 mm/s 5 ms later, half finds it 15 to 20 ms sooner; bursts raise no alarm in 25 min (half: in 3 min)"""
+    chatter_speed_m_per_s: float = 8e-3
+    """speed that they don't reach: 2 pi 9 Hz 0.1 mm is 5.7 mm/s, and noise adds to it"""
+    chatter_time_s: float = 0.12
+    """time in which they return: one period of 9 Hz"""
+    sway_m: float = 80e-6
+    """displacement that counts at higher speeds"""
+
+    def parameters(self, period_s: float, samples_per_false_alarm: float) -> RowArray:
+        """Return the parameters of the stage (1,), as GRIP_ROW."""
+        least, most = self.tremor_std_range_m
+        named = {
+            "period_s": period_s,
+            "log_threshold": math.log(samples_per_false_alarm),
+            "onset_stride": max(1, round(_ONSET_PERIOD_S / period_s)),
+            "log_creep_variance": 2 * math.log(self.creep_std_m_per_s),
+            "level_drift_variance": self.level_drift_std_m**2,
+            "log_tremor_variance": 2 * math.log(self.tremor_std_m),
+            "min_log_tremor_variance": 2 * math.log(least),
+            "max_log_tremor_variance": 2 * math.log(most),
+            "tremor_rate": 2 * math.pi * self.tremor_corner_hz,
+            "tremor_time_constant_s": self.tremor_time_constant_s,
+            "creep_time_constant_s": self.creep_time_constant_s,
+            "coupling_variance": self.coupling_std_m**2,
+            "coupling_drift_variance": (self.coupling_std_m * self.coupling_drift_per_s) ** 2,
+            "chatter_m": self.chatter_m,
+            "chatter_speed": self.chatter_speed_m_per_s,
+            "chatter_time_s": self.chatter_time_s,
+            "sway_m": self.sway_m,
+        }
+        row = np.zeros(1, GRIP_ROW)
+        for name in named:
+            row[name] = named[name]
+        return view_rows(row, GRIP_ROW)
+
+
+class SlipDetector:
+    """Detects slip and lift-off of contacts on n pads, in the results of a tick.
+
+    values (n, VALUE_COUNT), total_a, times [ns] and ids (n,) are those of the tick, of the contacts' newest
+    samples; they are read in place.
+
+    `state` (n, SLIP_COUNT), in rows of SLIP_ROW, the `contact_id` (n,) that it is about, 0 for none, and
+    `sample_ns` (n,) of the last sample that counted are all that survives a tick; they are in `held`.
+    `requested` (n,): pads it runs for. `samples_per_false_alarm` is the lower bound on the mean number of
+    samples of a contact from one false alarm to the next.
     """
 
     def __init__(
         self,
-        parameters: memoryview[float],
-        work: memoryview[float],
-        state: memoryview[float],
-        contact_id: memoryview[int],
-        sample_ns: memoryview[int],
-        values: memoryview[float],
-        total_a: memoryview[float],
-        times: memoryview[int],
-        ids: memoryview[int],
+        period_s: float,
+        values: FloatArray,
+        total_a: FloatArray,
+        times: NDArray[np.int64],
+        ids: NDArray[np.uint32],
+        held: TickState,
+        false_alarm_s: float = FALSE_ALARM_S,
+        grip: GripModel | None = None,
     ) -> None:
-        self.parameters, self.work, self.state = parameters, work, state
-        self.contact_id, self.sample_ns = contact_id, sample_ns
-        self.values, self.total_a, self.times, self.ids = values, total_a, times, ids
+        self.state, self.contact_id = held.slip, held.slip_contact_id
+        self.sample_ns, self.requested = held.slip_sample_ns, held.slip_requested
+        self.any_requested = False
+        self.samples_per_false_alarm = max(false_alarm_s / period_s, 2.0)
+        self.grip = (grip or GripModel()).parameters(period_s, self.samples_per_false_alarm)
+        self.rows, self.values = view_rows(held.slip, SLIP_ROW), view_rows(values, VALUE_ROW)
+        self.known, self.counted = view_memory(held.slip_contact_id), view_memory(held.slip_sample_ns)
+        self.total_a, self.times, self.ids = view_memory(total_a), view_memory(times), view_memory(ids)
+        self.work = view_memory(np.zeros(7 * _ONSETS))
         self.x = self.y = self.noise_x = self.noise_y = self.press = self.dt_s = 0.0
         self.f11 = self.f12 = self.f21 = self.f22 = 0.0  # tremor and its speed over dt
         self.q11 = self.q12 = self.q22 = 0.0  # what they gain, relative to the tremor's variance
@@ -153,288 +211,344 @@ class SlipStage:
         self.alarm_ratio = _NO_SLIP  # ln R of onsets that chatter can't explain
         self.gain0 = self.gain1 = self.gain2 = self.gain3 = 0.0
 
-    def detect_slips(self, pads: memoryview[int]) -> None:
-        """Process the newest samples of the contacts on these pads."""
-        for k in range(len(pads)):
-            process_sample(self, pads[k])
+    def set_requested(self, pads: BoolArray) -> None:
+        """Set the pads (n,) it runs for; contacts on changed ones start afresh."""
+        self.restart_contacts(np.flatnonzero(pads != self.requested))
+        self.requested[:] = pads
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Compute what follows from the state, after that was loaded."""
+        self.any_requested = bool(self.requested.any())
+
+    def restart_contacts(self, pads: IntArray) -> None:
+        """Start the contacts on these pads (k,) afresh with their next sample."""
+        self.contact_id[pads] = 0
+
+    def detect_slips(self, pads: IntArray) -> None:
+        """Process the newest sample of the contact on each of these pads (k,), if requested."""
+        for pad in pads[self.requested[pads]].tolist():
+            process_sample(self, pad)
+
+    def contacts(self) -> Any:
+        """Return the state in rows of SLIP_ROW (n,), as a view."""
+        return view_rows(self.state, SLIP_ROW)
 
 
-def process_sample(stage: SlipStage, pad: int) -> None:
+def process_sample(slips: SlipDetector, pad: int) -> None:
     """Process a contact's newest sample; one without position only ages the evidence."""
-    state, row, values = stage.state, pad * _COUNT, pad * _VALUES
-    _read_sample(stage, pad)
-    usable = -_INFINITY < stage.x + stage.y + stage.noise_x + stage.noise_y + stage.press < _INFINITY
-    force = stage.values[values + _FORCE_N]
+    _read_sample(slips, pad)
+    usable = -_INFINITY < slips.x + slips.y + slips.noise_x + slips.noise_y + slips.press < _INFINITY
+    force = slips.values[pad].force_n
     known = -_INFINITY < force < _INFINITY
-    stage.dt_s, stage.alarm_ratio = 0.0, _NO_SLIP
-    if stage.contact_id[pad] != stage.ids[pad]:
+    slips.dt_s, slips.alarm_ratio = 0.0, _NO_SLIP
+    if slips.known[pad] != slips.ids[pad]:
         if not usable:
             return
-        stage.contact_id[pad], stage.sample_ns[pad] = stage.ids[pad], stage.times[pad]
-        peak = state[row + _PEAK_CURRENT]
-        state[row + _FIRM_CURRENT] = max(peak, _FIRM_CURRENT_FACTOR * stage.total_a[pad])
-        stage.press = stage.total_a[pad] / max(state[row + _FIRM_CURRENT], 1e-12)
-        _begin_contact(stage, row, force if known else 0.0)
-        _start_test(stage, row, False)
-    elif usable and stage.times[pad] > stage.sample_ns[pad]:
-        stage.dt_s = (stage.times[pad] - stage.sample_ns[pad]) * 1e-9
-        stage.sample_ns[pad] = stage.times[pad]
-        state[row + _AGE] += stage.dt_s
-        _track_motion(stage, row, force if known else state[row + _FORCE])
-        _test_slip(stage, row)
-        if stage.alarm_ratio > stage.parameters[_LOG_THRESHOLD] and state[row + _SLIPPING] == 0.0:
-            _start_slip(stage, row)
-        if state[row + _SLIPPING] != 0.0:
-            _detect_rest(stage, row)
-    state[row + _SAMPLES] += 1.0
-    state[row + _PEAK_CURRENT] = max(state[row + _PEAK_CURRENT], stage.total_a[pad])
-    _classify(stage, row)
+        slips.known[pad], slips.counted[pad] = slips.ids[pad], slips.times[pad]
+        peak = slips.rows[pad].peak_current_a
+        slips.rows[pad].firm_current_a = max(peak, _FIRM_CURRENT_FACTOR * slips.total_a[pad])
+        slips.press = slips.total_a[pad] / max(slips.rows[pad].firm_current_a, 1e-12)
+        _begin_contact(slips, pad, force if known else 0.0)
+        _start_test(slips, pad, False)
+    elif usable and slips.times[pad] > slips.counted[pad]:
+        slips.dt_s = (slips.times[pad] - slips.counted[pad]) * 1e-9
+        slips.counted[pad] = slips.times[pad]
+        slips.rows[pad].age_s += slips.dt_s
+        _track_motion(slips, pad, force if known else slips.rows[pad].force_n)
+        _test_slip(slips, pad)
+        if slips.alarm_ratio > slips.grip[0].log_threshold and slips.rows[pad].slipping == 0.0:
+            _start_slip(slips, pad)
+        if slips.rows[pad].slipping != 0.0:
+            _detect_rest(slips, pad)
+    slips.rows[pad].samples += 1.0
+    slips.rows[pad].peak_current_a = max(slips.rows[pad].peak_current_a, slips.total_a[pad])
+    _classify(slips, pad)
 
 
-def _read_sample(stage: SlipStage, pad: int) -> None:
+def _read_sample(slips: SlipDetector, pad: int) -> None:
     """Read position, its noise, and the current relative to that of a firm contact."""
-    v, first = stage.values, pad * _VALUES
-    stage.x, stage.y = v[first + _PAD_M], v[first + _PAD_M + 1]
-    stage.noise_x, stage.noise_y = v[first + _PAD_NOISE], v[first + _PAD_NOISE + 2]
-    stage.press = stage.total_a[pad] / max(stage.state[pad * _COUNT + _FIRM_CURRENT], 1e-12)
-    if not stage.noise_x > _MIN_VARIANCE_M2 or not stage.noise_y > _MIN_VARIANCE_M2:
-        c = first + _COVARIANCE_M2  # too light for a noise estimate
-        whole = (v[c] + v[c + 4] + v[c + 8]) / 2.0
+    slips.x, slips.y = slips.values[pad].pad_m[0], slips.values[pad].pad_m[1]
+    slips.noise_x, slips.noise_y = slips.values[pad].pad_noise_m2[0], slips.values[pad].pad_noise_m2[2]
+    slips.press = slips.total_a[pad] / max(slips.rows[pad].firm_current_a, 1e-12)
+    if not slips.noise_x > _MIN_VARIANCE_M2 or not slips.noise_y > _MIN_VARIANCE_M2:
+        whole = slips.values[pad].covariance_m2[0] + slips.values[pad].covariance_m2[4]
+        whole = (whole + slips.values[pad].covariance_m2[8]) / 2.0  # too light for a noise estimate
         if whole < _MIN_VARIANCE_M2:
             whole = _MIN_VARIANCE_M2
-        if not stage.noise_x > _MIN_VARIANCE_M2:
-            stage.noise_x = whole
-        if not stage.noise_y > _MIN_VARIANCE_M2:
-            stage.noise_y = whole
+        if not slips.noise_x > _MIN_VARIANCE_M2:
+            slips.noise_x = whole
+        if not slips.noise_y > _MIN_VARIANCE_M2:
+            slips.noise_y = whole
 
 
-def _begin_contact(stage: SlipStage, row: int, force: float) -> None:
+def _begin_contact(slips: SlipDetector, pad: int, force: float) -> None:
     """Reset what is known of the contact before."""
-    s = stage.state
     for k in range(2):
-        s[row + _VELOCITY + k] = s[row + _VAR_PV + k] = s[row + _SLIP_VELOCITY + k] = 0.0
-        s[row + _VAR_VV + k] = _START_VELOCITY_VARIANCE
-    s[row + _POSITION], s[row + _POSITION + 1] = stage.x, stage.y
-    s[row + _VAR_PP], s[row + _VAR_PP + 1] = stage.noise_x, stage.noise_y
-    s[row + _FORCE], s[row + _RATE], s[row + _RATE_STD] = force, 0.0, abs(force)
-    s[row + _SAMPLES] = s[row + _AGE] = s[row + _SLIPPING] = s[row + _SLIPS] = s[row + _REST] = 0.0
-    s[row + _LOG_ODDS] = _NO_SLIP
+        slips.rows[pad].velocity_m_per_s[k] = slips.rows[pad].mixed_variance[k] = slips.rows[
+            pad
+        ].slip_velocity_m_per_s[k] = 0.0
+        slips.rows[pad].velocity_variance[k] = _START_VELOCITY_VARIANCE
+    slips.rows[pad].position_m[0], slips.rows[pad].position_m[1] = slips.x, slips.y
+    slips.rows[pad].position_variance[0], slips.rows[pad].position_variance[1] = slips.noise_x, slips.noise_y
+    slips.rows[pad].force_n, slips.rows[pad].force_rate_n_per_s, slips.rows[pad].force_rate_std = (
+        force,
+        0.0,
+        abs(force),
+    )
+    slips.rows[pad].samples = slips.rows[pad].age_s = slips.rows[pad].slipping = slips.rows[
+        pad
+    ].slips = slips.rows[pad].rest_s = 0.0
+    slips.rows[pad].log_odds = _NO_SLIP
 
 
-def _start_test(stage: SlipStage, row: int, kept: bool) -> None:
+def _start_test(slips: SlipDetector, pad: int, kept: bool) -> None:
     """Start the slip test; `kept`: the contact sticks again after a slip, what is learnt of it is kept."""
-    s, p = stage.state, stage.parameters
-    rate = p[_TREMOR_RATE]
+    rate = slips.grip[0].tremor_rate
     for axis in range(2):
-        tremor = s[row + _GRIP_TREMOR + axis] if kept else p[_TREMOR_START]
-        s[row + _TREMOR + axis] = tremor
-        variance, level, c = math.exp(tremor), row + _LEVEL + 4 * axis, row + _COVARIANCE + 10 * axis
+        tremor = slips.rows[pad].grip_log_tremor_variance[axis] if kept else slips.grip[0].log_tremor_variance
+        slips.rows[pad].log_tremor_variance[axis] = tremor
+        variance = math.exp(tremor)
         for k in range(4):
-            s[level + k] = 0.0
+            slips.rows[pad].motion[axis][k] = 0.0
         for k in range(10):
-            s[c + k] = 0.0
-        s[level] = stage.x if axis == 0 else stage.y
-        s[c] = _START_LEVEL_VARIANCE + (stage.noise_x if axis == 0 else stage.noise_y)
-        s[c + 4], s[c + 7], s[c + 9] = variance, variance * rate * rate, p[_COUPLING]
+            slips.rows[pad].covariance[axis][k] = 0.0
+        slips.rows[pad].motion[axis][_LEVEL] = slips.x if axis == 0 else slips.y
+        slips.rows[pad].covariance[axis][_LEVEL_LEVEL] = _START_LEVEL_VARIANCE + (
+            slips.noise_x if axis == 0 else slips.noise_y
+        )
+        slips.rows[pad].covariance[axis][_TREMOR_TREMOR] = variance
+        slips.rows[pad].covariance[axis][_SPEED_SPEED] = variance * rate * rate
+        slips.rows[pad].covariance[axis][_COUPLING_COUPLING] = slips.grip[0].coupling_variance
         for k in range(_ONSETS):
-            creep = axis * _ONSETS + k
-            s[row + _CREEP + creep] = s[row + _GRIP_CREEP + creep] if kept else p[_CREEP_START]
+            creep = (
+                slips.rows[pad].grip_log_creep_variance[axis][k] if kept else slips.grip[0].log_creep_variance
+            )
+            slips.rows[pad].log_creep_variance[axis][k] = creep
     for k in range(_ONSETS):
-        s[row + _AGES + k] = 0.0
-    for k in range(2 * _RAMP):
-        s[row + _RAMPS + k] = 0.0
+        slips.rows[pad].onset_ages_s[k] = 0.0
+        for block in range(_BLOCKS):
+            slips.rows[pad].ramps[0][block][k] = slips.rows[pad].ramps[1][block][k] = 0.0
     if not kept:
-        s[row + _PRESS_NOISE] = s[row + _LEARNING] = 0.0
-    s[row + _FIRST_PRESS] = s[row + _LAST_PRESS] = s[row + _BEFORE_PRESS] = stage.press
-    _keep_last(stage, row)
-    s[row + _TESTED] = s[row + _UNTIL_ONSET] = s[row + _ONSET_NUMBER] = s[row + _ONSET_AGE] = 0.0
-    s[row + _LOG_RATIO] = stage.alarm_ratio = _NO_SLIP
+        slips.rows[pad].press_noise = slips.rows[pad].learning_s = 0.0
+    slips.rows[pad].first_press = slips.rows[pad].last_press = slips.rows[pad].before_press = slips.press
+    _keep_last(slips, pad)
+    slips.rows[pad].tested = slips.rows[pad].until_onset = slips.rows[pad].onset_number = slips.rows[
+        pad
+    ].onset_age_s = 0.0
+    slips.rows[pad].log_ratio = slips.alarm_ratio = _NO_SLIP
 
 
-def _track_motion(stage: SlipStage, row: int, force: float) -> None:
+def _track_motion(slips: SlipDetector, pad: int, force: float) -> None:
     """Filter position (constant velocity with random acceleration) and the force's rate."""
-    s, dt = stage.state, stage.dt_s
+    dt = slips.dt_s
     density = _ACCELERATION_DENSITY * dt
     for axis in range(2):
-        pp, pv, vv = s[row + _VAR_PP + axis], s[row + _VAR_PV + axis], s[row + _VAR_VV + axis]
+        pp, pv, vv = (
+            slips.rows[pad].position_variance[axis],
+            slips.rows[pad].mixed_variance[axis],
+            slips.rows[pad].velocity_variance[axis],
+        )
         pp += dt * (2.0 * pv + dt * (vv + density / 3.0))
         pv += dt * (vv + density / 2.0)
         vv += density
-        at = s[row + _POSITION + axis] + dt * s[row + _VELOCITY + axis]
-        total = pp + (stage.noise_x if axis == 0 else stage.noise_y)
-        off = (stage.x if axis == 0 else stage.y) - at
+        at = slips.rows[pad].position_m[axis] + dt * slips.rows[pad].velocity_m_per_s[axis]
+        total = pp + (slips.noise_x if axis == 0 else slips.noise_y)
+        off = (slips.x if axis == 0 else slips.y) - at
         by_position, by_velocity = pp / total, pv / total
-        s[row + _POSITION + axis] = at + by_position * off
-        s[row + _VELOCITY + axis] += by_velocity * off
-        s[row + _VAR_VV + axis] = vv - by_velocity * pv
-        s[row + _VAR_PV + axis] = pv - by_position * pv
-        s[row + _VAR_PP + axis] = pp - by_position * pp
+        slips.rows[pad].position_m[axis] = at + by_position * off
+        slips.rows[pad].velocity_m_per_s[axis] += by_velocity * off
+        slips.rows[pad].velocity_variance[axis] = vv - by_velocity * pv
+        slips.rows[pad].mixed_variance[axis] = pv - by_position * pv
+        slips.rows[pad].position_variance[axis] = pp - by_position * pp
     part = 1.0 - math.exp(-dt / _FORCE_RATE_TIME_S)
-    rate = (force - s[row + _FORCE]) / (dt + _FORCE_RATE_TIME_S * (1.0 - part))
-    s[row + _FORCE] += part * (force - s[row + _FORCE])
-    s[row + _RATE] += part * (rate - s[row + _RATE])
-    slow, std = min(dt, 1.0), s[row + _RATE_STD]
-    s[row + _RATE_STD] = math.sqrt((1.0 - slow) * std * std + slow * s[row + _RATE] * s[row + _RATE] + 1e-12)
+    rate = (force - slips.rows[pad].force_n) / (dt + _FORCE_RATE_TIME_S * (1.0 - part))
+    slips.rows[pad].force_n += part * (force - slips.rows[pad].force_n)
+    slips.rows[pad].force_rate_n_per_s += part * (rate - slips.rows[pad].force_rate_n_per_s)
+    slow, std = min(dt, 1.0), slips.rows[pad].force_rate_std
+    slips.rows[pad].force_rate_std = math.sqrt(
+        (1.0 - slow) * std * std
+        + slow * slips.rows[pad].force_rate_n_per_s * slips.rows[pad].force_rate_n_per_s
+        + 1e-12
+    )
 
 
-def _test_slip(stage: SlipStage, row: int) -> None:
+def _test_slip(slips: SlipDetector, pad: int) -> None:
     """Run one step of the test and compute ln R."""
-    s = stage.state
-    press, before = s[row + _LAST_PRESS], s[row + _BEFORE_PRESS]
-    bend = stage.press - 2.0 * press + before  # tremor is far slower than noise
-    part = max(1.0 / (1.0 + s[row + _TESTED]), _PRESS_NOISE_GAIN)
-    s[row + _PRESS_NOISE] += part * (bend * bend / 6.0 - s[row + _PRESS_NOISE])
-    s[row + _BEFORE_PRESS], s[row + _LAST_PRESS] = press, stage.press
-    _set_transition(stage)
-    _advance_onsets(stage, row)
-    s[row + _TESTED] += 1.0
-    s[row + _LEARNING] += stage.dt_s
+    press, before = slips.rows[pad].last_press, slips.rows[pad].before_press
+    bend = slips.press - 2.0 * press + before  # tremor is far slower than noise
+    part = max(1.0 / (1.0 + slips.rows[pad].tested), _PRESS_NOISE_GAIN)
+    slips.rows[pad].press_noise += part * (bend * bend / 6.0 - slips.rows[pad].press_noise)
+    slips.rows[pad].before_press, slips.rows[pad].last_press = press, slips.press
+    _set_transition(slips)
+    _advance_onsets(slips, pad)
+    slips.rows[pad].tested += 1.0
+    slips.rows[pad].learning_s += slips.dt_s
     for axis in range(2):
-        _filter_axis(stage, row, axis)
-        _advance_ramps(stage, row, row + _RAMPS + axis * _RAMP)
-        _learn_creep(stage, row, axis)
-    _sum_ratios(stage, row)
-    _keep_last(stage, row)
+        _filter_axis(slips, pad, axis)
+        _advance_ramps(slips, pad, axis)
+        _learn_creep(slips, pad, axis)
+    _sum_ratios(slips, pad)
+    _keep_last(slips, pad)
 
 
-def _keep_last(stage: SlipStage, row: int) -> None:
+def _keep_last(slips: SlipDetector, pad: int) -> None:
     """Keep the position of this sample, and the larger variance of its noise."""
-    s = stage.state
-    s[row + _LAST], s[row + _LAST + 1] = stage.x, stage.y
-    s[row + _LAST_NOISE] = max(stage.noise_x, stage.noise_y)
+    slips.rows[pad].last_m[0], slips.rows[pad].last_m[1] = slips.x, slips.y
+    slips.rows[pad].last_noise_m2 = max(slips.noise_x, slips.noise_y)
 
 
-def _set_transition(stage: SlipStage) -> None:
+def _set_transition(slips: SlipDetector) -> None:
     """Set how tremor and its speed pass from the last sample to this one."""
-    dt, rate = stage.dt_s, stage.parameters[_TREMOR_RATE]
+    dt, rate = slips.dt_s, slips.grip[0].tremor_rate
     passed = rate * dt
     decay, squared = math.exp(-passed), rate * rate
-    stage.f11, stage.f12 = decay * (1.0 + passed), decay * dt
-    stage.f21, stage.f22 = -decay * rate * passed, decay * (1.0 - passed)
-    stage.q11 = 1.0 - (stage.f11 * stage.f11 + stage.f12 * stage.f12 * squared)
-    stage.q12 = -(stage.f11 * stage.f21 + stage.f12 * stage.f22 * squared)
-    stage.q22 = squared - (stage.f21 * stage.f21 + stage.f22 * stage.f22 * squared)
+    slips.f11, slips.f12 = decay * (1.0 + passed), decay * dt
+    slips.f21, slips.f22 = -decay * rate * passed, decay * (1.0 - passed)
+    slips.q11 = 1.0 - (slips.f11 * slips.f11 + slips.f12 * slips.f12 * squared)
+    slips.q12 = -(slips.f11 * slips.f21 + slips.f12 * slips.f22 * squared)
+    slips.q22 = squared - (slips.f21 * slips.f21 + slips.f22 * slips.f22 * squared)
 
 
-def _filter_axis(stage: SlipStage, row: int, axis: int) -> None:
+def _filter_axis(slips: SlipDetector, pad: int, axis: int) -> None:
     """Run one step of an axis' Kalman filter: level, tremor, its speed, coupling to the pressure."""
-    s, p, dt = stage.state, stage.parameters, stage.dt_s
-    f11, f12, f21, f22 = stage.f11, stage.f12, stage.f21, stage.f22
-    first, c = row + _LEVEL + 4 * axis, row + _COVARIANCE + 10 * axis
-    log_tremor = s[row + _TREMOR + axis]
+    dt = slips.dt_s
+    f11, f12, f21, f22 = slips.f11, slips.f12, slips.f21, slips.f22
+    log_tremor = slips.rows[pad].log_tremor_variance[axis]
     tremor = math.exp(log_tremor)
-    level, coupling = s[first], s[first + 3]
-    shake, speed = f11 * s[first + 1] + f12 * s[first + 2], f21 * s[first + 1] + f22 * s[first + 2]
-    c01, c02 = f11 * s[c + 1] + f12 * s[c + 2], f21 * s[c + 1] + f22 * s[c + 2]
-    c11 = f11 * f11 * s[c + 4] + 2.0 * f11 * f12 * s[c + 5] + f12 * f12 * s[c + 7] + tremor * stage.q11
-    c12 = f11 * f21 * s[c + 4] + (f11 * f22 + f12 * f21) * s[c + 5] + f12 * f22 * s[c + 7]
-    c12 += tremor * stage.q12
-    c22 = f21 * f21 * s[c + 4] + 2.0 * f21 * f22 * s[c + 5] + f22 * f22 * s[c + 7] + tremor * stage.q22
-    c13, c23 = f11 * s[c + 6] + f12 * s[c + 8], f21 * s[c + 6] + f22 * s[c + 8]
-    c00, c03, c33 = s[c] + p[_LEVEL_DRIFT] * dt, s[c + 3], s[c + 9] + p[_COUPLING_DRIFT] * dt
-    pressed = stage.press - s[row + _FIRST_PRESS]
+    level, coupling = slips.rows[pad].motion[axis][_LEVEL], slips.rows[pad].motion[axis][_COUPLING]
+    c11, c12 = slips.rows[pad].motion[axis][_TREMOR], slips.rows[pad].motion[axis][_SPEED]
+    shake, speed = f11 * c11 + f12 * c12, f21 * c11 + f22 * c12
+    c11, c12 = slips.rows[pad].covariance[axis][_LEVEL_TREMOR], slips.rows[pad].covariance[axis][_LEVEL_SPEED]
+    c01, c02 = f11 * c11 + f12 * c12, f21 * c11 + f22 * c12
+    c11 = slips.rows[pad].covariance[axis][_TREMOR_COUPLING]
+    c12 = slips.rows[pad].covariance[axis][_SPEED_COUPLING]
+    c13, c23 = f11 * c11 + f12 * c12, f21 * c11 + f22 * c12
+    tt, ts = slips.rows[pad].covariance[axis][_TREMOR_TREMOR], slips.rows[pad].covariance[axis][_TREMOR_SPEED]
+    ss = slips.rows[pad].covariance[axis][_SPEED_SPEED]
+    c11 = f11 * f11 * tt + 2.0 * f11 * f12 * ts + f12 * f12 * ss + tremor * slips.q11
+    c12 = f11 * f21 * tt + (f11 * f22 + f12 * f21) * ts + f12 * f22 * ss
+    c12 += tremor * slips.q12
+    c22 = f21 * f21 * tt + 2.0 * f21 * f22 * ts + f22 * f22 * ss + tremor * slips.q22
+    c00 = slips.rows[pad].covariance[axis][_LEVEL_LEVEL] + slips.grip[0].level_drift_variance * dt
+    c03 = slips.rows[pad].covariance[axis][_LEVEL_COUPLING]
+    c33 = slips.rows[pad].covariance[axis][_COUPLING_COUPLING] + slips.grip[0].coupling_drift_variance * dt
+    pressed = slips.press - slips.rows[pad].first_press
     a0, a1 = c00 + c01 + pressed * c03, c01 + c11 + pressed * c13
     a2, a3 = c02 + c12 + pressed * c23, c03 + c13 + pressed * c33
-    variance = a0 + a1 + pressed * a3 + (stage.noise_x if axis == 0 else stage.noise_y)
-    variance += (coupling * coupling + c33) * s[row + _PRESS_NOISE]
-    innovation = (stage.x if axis == 0 else stage.y) - (level + shake + pressed * coupling)
+    variance = a0 + a1 + pressed * a3 + (slips.noise_x if axis == 0 else slips.noise_y)
+    variance += (coupling * coupling + c33) * slips.rows[pad].press_noise
+    innovation = (slips.x if axis == 0 else slips.y) - (level + shake + pressed * coupling)
     g0, g1, g2, g3 = a0 / variance, a1 / variance, a2 / variance, a3 / variance
-    s[first], s[first + 1] = level + g0 * innovation, shake + g1 * innovation
-    s[first + 2], s[first + 3] = speed + g2 * innovation, coupling + g3 * innovation
-    s[c], s[c + 1], s[c + 2], s[c + 3] = c00 - g0 * a0, c01 - g0 * a1, c02 - g0 * a2, c03 - g0 * a3
-    s[c + 4], s[c + 5], s[c + 6] = c11 - g1 * a1, c12 - g1 * a2, c13 - g1 * a3
-    s[c + 7], s[c + 8], s[c + 9] = c22 - g2 * a2, c23 - g2 * a3, c33 - g3 * a3
+    slips.rows[pad].motion[axis][_LEVEL] = level + g0 * innovation
+    slips.rows[pad].motion[axis][_TREMOR] = shake + g1 * innovation
+    slips.rows[pad].motion[axis][_SPEED] = speed + g2 * innovation
+    slips.rows[pad].motion[axis][_COUPLING] = coupling + g3 * innovation
+    slips.rows[pad].covariance[axis][_LEVEL_LEVEL] = c00 - g0 * a0
+    slips.rows[pad].covariance[axis][_LEVEL_TREMOR] = c01 - g0 * a1
+    slips.rows[pad].covariance[axis][_LEVEL_SPEED] = c02 - g0 * a2
+    slips.rows[pad].covariance[axis][_LEVEL_COUPLING] = c03 - g0 * a3
+    slips.rows[pad].covariance[axis][_TREMOR_TREMOR] = c11 - g1 * a1
+    slips.rows[pad].covariance[axis][_TREMOR_SPEED] = c12 - g1 * a2
+    slips.rows[pad].covariance[axis][_TREMOR_COUPLING] = c13 - g1 * a3
+    slips.rows[pad].covariance[axis][_SPEED_SPEED] = c22 - g2 * a2
+    slips.rows[pad].covariance[axis][_SPEED_COUPLING] = c23 - g2 * a3
+    slips.rows[pad].covariance[axis][_COUPLING_COUPLING] = c33 - g3 * a3
     excess = min(innovation * innovation / variance, _MAX_SQUARED_INNOVATION) - 1.0
-    log_tremor += excess * (dt / p[_TREMOR_TIME])
-    s[row + _TREMOR + axis] = min(max(log_tremor, p[_TREMOR_MIN]), p[_TREMOR_MAX])
-    stage.innovation, stage.variance = innovation, variance
-    stage.gain0, stage.gain1, stage.gain2, stage.gain3 = g0, g1, g2, g3
+    log_tremor += excess * (dt / slips.grip[0].tremor_time_constant_s)
+    slips.rows[pad].log_tremor_variance[axis] = min(
+        max(log_tremor, slips.grip[0].min_log_tremor_variance), slips.grip[0].max_log_tremor_variance
+    )
+    slips.innovation, slips.variance = innovation, variance
+    slips.gain0, slips.gain1, slips.gain2, slips.gain3 = g0, g1, g2, g3
 
 
-def _advance_onsets(stage: SlipStage, row: int) -> None:
+def _advance_onsets(slips: SlipDetector, pad: int) -> None:
     """Age the onset hypotheses and open a new one periodically; the others shift, slots are sorted by age."""
-    s, ages = stage.state, row + _AGES
     for k in range(_ONSETS):
-        if s[ages + k] > 0.0:
-            s[ages + k] += stage.dt_s
-    if s[row + _UNTIL_ONSET] > 0.0:
-        s[row + _UNTIL_ONSET] -= 1.0
+        if slips.rows[pad].onset_ages_s[k] > 0.0:
+            slips.rows[pad].onset_ages_s[k] += slips.dt_s
+    if slips.rows[pad].until_onset > 0.0:
+        slips.rows[pad].until_onset -= 1.0
         return
-    s[row + _UNTIL_ONSET] = stage.parameters[_STRIDE] - 1.0
-    s[row + _ONSET_NUMBER] += 1.0
-    if s[row + _ONSET_NUMBER] >= _OLDER_STRIDE:  # the others between two strides are dropped
-        s[row + _ONSET_NUMBER] = 0.0
-        _shift_onsets(stage, row, _RECENT, _ONSETS)
-    _shift_onsets(stage, row, 1, _RECENT)
-    s[ages] = stage.dt_s  # it began with the previous sample
+    slips.rows[pad].until_onset = slips.grip[0].onset_stride - 1.0
+    slips.rows[pad].onset_number += 1.0
+    if slips.rows[pad].onset_number >= _OLDER_STRIDE:  # the others between two strides are dropped
+        slips.rows[pad].onset_number = 0.0
+        _shift_onsets(slips, pad, _RECENT, _ONSETS)
+    _shift_onsets(slips, pad, 1, _RECENT)
+    slips.rows[pad].onset_ages_s[0] = slips.dt_s  # it began with the previous sample
     for axis in range(2):
-        for k in range(6):
-            s[row + _RAMPS + axis * _RAMP + k * _ONSETS] = 0.0
-        s[row + _RAMPS + axis * _RAMP + _START] = s[row + _LAST + axis]
-    s[row + _RAMPS + _START_NOISE] = s[row + _LAST_NOISE]
+        for block in range(_START):
+            slips.rows[pad].ramps[axis][block][0] = 0.0
+        slips.rows[pad].ramps[axis][_START][0] = slips.rows[pad].last_m[axis]
+    slips.rows[pad].ramps[0][_START_NOISE][0] = slips.rows[pad].last_noise_m2
 
 
-def _shift_onsets(stage: SlipStage, row: int, first: int, stop: int) -> None:
+def _shift_onsets(slips: SlipDetector, pad: int, first: int, stop: int) -> None:
     """Give the slots first .. stop - 1 what is in the slots before each."""
-    s = stage.state
     for k in range(stop - first):
-        s[row + _AGES + stop - 1 - k] = s[row + _AGES + stop - 2 - k]
-    for block in range(2 * _RAMP // _ONSETS):
-        slots = row + _RAMPS + block * _ONSETS
-        for k in range(stop - first):
-            s[slots + stop - 1 - k] = s[slots + stop - 2 - k]
+        slips.rows[pad].onset_ages_s[stop - 1 - k] = slips.rows[pad].onset_ages_s[stop - 2 - k]
+    for axis in range(2):
+        for block in range(_BLOCKS):
+            for k in range(stop - first):
+                slips.rows[pad].ramps[axis][block][stop - 1 - k] = slips.rows[pad].ramps[axis][block][
+                    stop - 2 - k
+                ]
 
 
-def _advance_ramps(stage: SlipStage, row: int, ramps: int) -> None:
+def _advance_ramps(slips: SlipDetector, pad: int, axis: int) -> None:
     """Update an axis' responses of the filter to ramps of 1 m/s, and the sums of f nu / S and f^2 / S."""
-    s, ages = stage.state, row + _AGES
-    f11, f12, f21, f22 = stage.f11, stage.f12, stage.f21, stage.f22
-    g0, g1, g2, g3 = stage.gain0, stage.gain1, stage.gain2, stage.gain3
-    pressed = stage.press - s[row + _FIRST_PRESS]
-    precision, innovation = 1.0 / stage.variance, stage.innovation
+    f11, f12, f21, f22 = slips.f11, slips.f12, slips.f21, slips.f22
+    g0, g1, g2, g3 = slips.gain0, slips.gain1, slips.gain2, slips.gain3
+    pressed = slips.press - slips.rows[pad].first_press
+    precision, innovation = 1.0 / slips.variance, slips.innovation
     for k in range(_ONSETS):
-        r = ramps + k
-        shake = f11 * s[r + _ONSETS] + f12 * s[r + 2 * _ONSETS]
-        speed = f21 * s[r + _ONSETS] + f22 * s[r + 2 * _ONSETS]
-        f = s[ages + k] - (s[r] + shake + pressed * s[r + 3 * _ONSETS])
-        s[r] += g0 * f
-        s[r + _ONSETS] = shake + g1 * f
-        s[r + 2 * _ONSETS] = speed + g2 * f
-        s[r + 3 * _ONSETS] += g3 * f
+        tremor, rate = slips.rows[pad].ramps[axis][_TREMOR][k], slips.rows[pad].ramps[axis][_SPEED][k]
+        shake, speed = f11 * tremor + f12 * rate, f21 * tremor + f22 * rate
+        met = slips.rows[pad].ramps[axis][_LEVEL][k] + shake
+        f = slips.rows[pad].onset_ages_s[k] - (met + pressed * slips.rows[pad].ramps[axis][_COUPLING][k])
+        slips.rows[pad].ramps[axis][_LEVEL][k] += g0 * f
+        slips.rows[pad].ramps[axis][_TREMOR][k] = shake + g1 * f
+        slips.rows[pad].ramps[axis][_SPEED][k] = speed + g2 * f
+        slips.rows[pad].ramps[axis][_COUPLING][k] += g3 * f
         weighted = f * precision
-        s[r + _SCORE] += weighted * innovation
-        s[r + _INFORMATION] += weighted * f
+        slips.rows[pad].ramps[axis][_SCORE][k] += weighted * innovation
+        slips.rows[pad].ramps[axis][_INFORMATION][k] += weighted * f
 
 
-def _learn_creep(stage: SlipStage, row: int, axis: int) -> None:
+def _learn_creep(slips: SlipDetector, pad: int, axis: int) -> None:
     """Learn the creep variance by onset age; set the part of the ramps' evidence that counts.
 
     A ramp of information I, while the contact creeps at speeds of variance v, meets 1 + I v times its own.
     """
-    s, p, work = stage.state, stage.parameters, stage.work
-    ramps, creeps, parts = row + _RAMPS + axis * _RAMP, row + _CREEP + axis * _ONSETS, 2 * axis * _ONSETS
-    pace = stage.dt_s / min(max(s[row + _LEARNING], _MIN_LEARNING_S), p[_CREEP_TIME])
+    work, parts = slips.work, 2 * axis * _ONSETS
+    pace = slips.dt_s / min(
+        max(slips.rows[pad].learning_s, _MIN_LEARNING_S), slips.grip[0].creep_time_constant_s
+    )
     for k in range(_ONSETS):
-        score, information = s[ramps + _SCORE + k], s[ramps + _INFORMATION + k]
-        if s[row + _AGES + k] > 0.0:
-            more = 1.0 + information * math.exp(s[creeps + k])
+        score = slips.rows[pad].ramps[axis][_SCORE][k]
+        information = slips.rows[pad].ramps[axis][_INFORMATION][k]
+        if slips.rows[pad].onset_ages_s[k] > 0.0:
+            more = 1.0 + information * math.exp(slips.rows[pad].log_creep_variance[axis][k])
             met = score * score / max(information, 1e-300)
             slope = (min(met / more, _MAX_SQUARED_INNOVATION) - 1.0) * (1.0 - 1.0 / more)
             if slope < 0.0:
                 slope *= _DECREASE_FACTOR
-            s[creeps + k] = min(max(s[creeps + k] + slope * pace, _MIN_LOG_CREEP), _MAX_LOG_CREEP)
+            creep = slips.rows[pad].log_creep_variance[axis][k] + slope * pace
+            slips.rows[pad].log_creep_variance[axis][k] = min(max(creep, _MIN_LOG_CREEP), _MAX_LOG_CREEP)
             part = 1.0 / (more * math.sqrt(math.sqrt(more)))  # allows for tails that deviate from the model
             work[parts + k] = part * information
             work[parts + _ONSETS + k] = part * score * (part * score)
 
 
-def _sum_ratios(stage: SlipStage, row: int) -> None:
+def _sum_ratios(slips: SlipDetector, pad: int) -> None:
     """Compute ln R from the onsets' likelihood ratios, each weighted by the samples it stands for; and that
     of the onsets that chatter can't explain by its return."""
-    s, work = stage.state, stage.work
+    work = slips.work
     most = _NO_SLIP
     for k in range(_ONSETS):
-        if s[row + _AGES + k] > 0.0:
+        if slips.rows[pad].onset_ages_s[k] > 0.0:
             slow, medium, fast = 4 * _ONSETS + k, 5 * _ONSETS + k, 6 * _ONSETS + k
             work[slow] = _log_ratio(work, k, _SLOW)
             work[medium] = _log_ratio(work, k, _MEDIUM)
@@ -442,44 +556,48 @@ def _sum_ratios(stage: SlipStage, row: int) -> None:
             most = max(most, work[slow], work[medium], work[fast])
     total, left, best, largest = 0.0, 0.0, 0, -1.0
     for k in range(_ONSETS):
-        if s[row + _AGES + k] > 0.0 and _is_far(stage, row, k, k):
+        if slips.rows[pad].onset_ages_s[k] > 0.0 and _is_far(slips, pad, k, k):
             share = math.exp(work[4 * _ONSETS + k] - most)
             share += math.exp(work[5 * _ONSETS + k] - most)
             share += math.exp(work[6 * _ONSETS + k] - most)
             share *= (1.0 if k < _RECENT else 1.0 * _OLDER_STRIDE) / 3.0
             total += share
-            if _has_left(stage, row, k):
+            if _has_left(slips, pad, k):
                 left += share
             if share > largest:
                 largest, best = share, k
-    s[row + _LOG_RATIO] = most + math.log(max(total, 1e-300) * stage.parameters[_STRIDE])
-    stage.alarm_ratio = most + math.log(max(left, 1e-300) * stage.parameters[_STRIDE])
-    if s[row + _LOG_RATIO] > _MIN_ONSET_LOG_ODDS:
-        s[row + _ONSET_AGE] = s[row + _AGES + best]
+    slips.rows[pad].log_ratio = most + math.log(max(total, 1e-300) * slips.grip[0].onset_stride)
+    slips.alarm_ratio = most + math.log(max(left, 1e-300) * slips.grip[0].onset_stride)
+    if slips.rows[pad].log_ratio > _MIN_ONSET_LOG_ODDS:
+        slips.rows[pad].onset_age_s = slips.rows[pad].onset_ages_s[best]
         for axis in range(2):
-            ramps = row + _RAMPS + axis * _RAMP + best
-            s[row + _SLIP_VELOCITY + axis] = s[ramps + _SCORE] / max(s[ramps + _INFORMATION], 1e-12)
+            score = slips.rows[pad].ramps[axis][_SCORE][best]
+            information = slips.rows[pad].ramps[axis][_INFORMATION][best]
+            slips.rows[pad].slip_velocity_m_per_s[axis] = score / max(information, 1e-12)
 
 
-def _is_far(stage: SlipStage, row: int, k: int, j: int) -> bool:
+def _is_far(slips: SlipDetector, pad: int, k: int, j: int) -> bool:
     """Return whether the contact is farther from its position at onset j than chatter moves it since k, by
     more than noise does."""
-    s, p = stage.state, stage.parameters
-    limit = min(p[_CHATTER], p[_SWAY] + p[_CHATTER_SPEED] * s[row + _AGES + k])
-    noise = max(stage.noise_x, stage.noise_y) + s[row + _RAMPS + _START_NOISE + j]
-    x = stage.x - s[row + _RAMPS + _START + j]
-    y = stage.y - s[row + _RAMPS + _RAMP + _START + j]
-    return x * x + y * y > limit * limit + _NOISE_SIGMA * _NOISE_SIGMA * noise
+    limit = min(
+        slips.grip[0].chatter_m,
+        slips.grip[0].sway_m + slips.grip[0].chatter_speed * slips.rows[pad].onset_ages_s[k],
+    )
+    noise = max(slips.noise_x, slips.noise_y) + slips.rows[pad].ramps[0][_START_NOISE][j]
+    x = slips.x - slips.rows[pad].ramps[0][_START][j]
+    y = slips.y - slips.rows[pad].ramps[1][_START][j]
+    far: bool = x * x + y * y > limit * limit + _NOISE_SIGMA * _NOISE_SIGMA * noise
+    return far
 
 
-def _has_left(stage: SlipStage, row: int, k: int) -> bool:
+def _has_left(slips: SlipDetector, pad: int, k: int) -> bool:
     """Return whether the contact is as far from its positions in the time before onset k in which chatter
     returns, as known from older onsets."""
-    ages, since_s = row + _AGES, stage.state[row + _AGES + k] + stage.parameters[_CHATTER_TIME]
+    since_s = slips.rows[pad].onset_ages_s[k] + slips.grip[0].chatter_time_s
     for j in range(k + 1, _ONSETS):
-        if stage.state[ages + j] == 0.0 or stage.state[ages + j] > since_s:
+        if slips.rows[pad].onset_ages_s[j] == 0.0 or slips.rows[pad].onset_ages_s[j] > since_s:
             return True
-        if not _is_far(stage, row, k, j):
+        if not _is_far(slips, pad, k, j):
             return False
     return True
 
@@ -492,44 +610,58 @@ def _log_ratio(work: memoryview[float], k: int, speed_variance: float) -> float:
     return 0.5 * (quotient - math.log(x * y))
 
 
-def _start_slip(stage: SlipStage, row: int) -> None:
+def _start_slip(slips: SlipDetector, pad: int) -> None:
     """Mark the contact as slipping since its likeliest onset: what is learnt now doesn't describe a grip."""
-    s = stage.state
-    s[row + _SLIPPING] = 1.0
-    s[row + _SLIPS] += 1.0
-    s[row + _REST] = 0.0
+    slips.rows[pad].slipping = 1.0
+    slips.rows[pad].slips += 1.0
+    slips.rows[pad].rest_s = 0.0
     for axis in range(2):
-        at = stage.x if axis == 0 else stage.y
-        s[row + _SLIP_START + axis] = at - s[row + _SLIP_VELOCITY + axis] * s[row + _ONSET_AGE]
-        s[row + _GRIP_TREMOR + axis] = s[row + _TREMOR + axis]
-    for k in range(2 * _ONSETS):
-        s[row + _GRIP_CREEP + k] = s[row + _CREEP + k]
+        at = slips.x if axis == 0 else slips.y
+        slips.rows[pad].slip_start_m[axis] = (
+            at - slips.rows[pad].slip_velocity_m_per_s[axis] * slips.rows[pad].onset_age_s
+        )
+        slips.rows[pad].grip_log_tremor_variance[axis] = slips.rows[pad].log_tremor_variance[axis]
+        for k in range(_ONSETS):
+            slips.rows[pad].grip_log_creep_variance[axis][k] = slips.rows[pad].log_creep_variance[axis][k]
 
 
-def _detect_rest(stage: SlipStage, row: int) -> None:
+def _detect_rest(slips: SlipDetector, pad: int) -> None:
     """Restart the test of a contact that slipped and has come to rest."""
-    s = stage.state
-    vx, vy = s[row + _VELOCITY], s[row + _VELOCITY + 1]
-    limit = max(2.0 * math.sqrt(s[row + _VAR_VV] + s[row + _VAR_VV + 1]), _MAX_REST_SPEED)
-    s[row + _REST] = s[row + _REST] + stage.dt_s if math.sqrt(vx * vx + vy * vy) < limit else 0.0
-    if s[row + _REST] > _MIN_REST_S:
-        s[row + _SLIPPING] = 0.0
-        s[row + _LOG_ODDS] = _NO_SLIP
-        _start_test(stage, row, True)
+    vx, vy = slips.rows[pad].velocity_m_per_s[0], slips.rows[pad].velocity_m_per_s[1]
+    limit = max(
+        2.0 * math.sqrt(slips.rows[pad].velocity_variance[0] + slips.rows[pad].velocity_variance[1]),
+        _MAX_REST_SPEED,
+    )
+    slips.rows[pad].rest_s = (
+        slips.rows[pad].rest_s + slips.dt_s if math.sqrt(vx * vx + vy * vy) < limit else 0.0
+    )
+    if slips.rows[pad].rest_s > _MIN_REST_S:
+        slips.rows[pad].slipping = 0.0
+        slips.rows[pad].log_odds = _NO_SLIP
+        _start_test(slips, pad, True)
 
 
-def _classify(stage: SlipStage, row: int) -> None:
+def _classify(slips: SlipDetector, pad: int) -> None:
     """Update ln of the odds of slip, R times the prior rate of slips at such forces, and the label.
 
     Recent evidence decays slowly, or a contact near the threshold would chatter.
     """
-    s = stage.state
-    falls = max(-s[row + _RATE], 0.0) / max(3.0 * s[row + _RATE_STD], 1e-9)
-    hazard = _SLIP_RATE_HZ * (1.0 + (_UNLOADING_FACTOR - 1.0) * min(falls, 1.0)) * stage.parameters[_PERIOD]
-    s[row + _LOG_ODDS] = max(
-        stage.alarm_ratio + math.log(hazard), s[row + _LOG_ODDS] - stage.dt_s / _ODDS_DECAY_S
+    falls = max(-slips.rows[pad].force_rate_n_per_s, 0.0) / max(3.0 * slips.rows[pad].force_rate_std, 1e-9)
+    hazard = _SLIP_RATE_HZ * (1.0 + (_UNLOADING_FACTOR - 1.0) * min(falls, 1.0)) * slips.grip[0].period_s
+    slips.rows[pad].log_odds = max(
+        slips.alarm_ratio + math.log(hazard), slips.rows[pad].log_odds - slips.dt_s / _ODDS_DECAY_S
     )
-    label = _SLIDING if s[row + _SLIPPING] != 0.0 else _INCIPIENT if s[row + _LOG_ODDS] > 0.0 else _STICKING
-    if s[row + _FORCE] + (_LIFT_OFF_HORIZON_S + _FORCE_RATE_TIME_S) * s[row + _RATE] < 0.0:
+    label = (
+        _SLIDING
+        if slips.rows[pad].slipping != 0.0
+        else _INCIPIENT
+        if slips.rows[pad].log_odds > 0.0
+        else _STICKING
+    )
+    if (
+        slips.rows[pad].force_n
+        + (_LIFT_OFF_HORIZON_S + _FORCE_RATE_TIME_S) * slips.rows[pad].force_rate_n_per_s
+        < 0.0
+    ):
         label = _LIFT_OFF
-    s[row + _LABEL] = 1.0 * label
+    slips.rows[pad].label = 1.0 * label

@@ -7,13 +7,16 @@ Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFI
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from handtouch.core.memory import row_count, slices_of
+from handtouch.core.memory import RowArray, row_count, slices_of, view_memory
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
-from handtouch.core.stages import force, locate, pairs, tables, tolerances
+from handtouch.core.stages import elongation, force, locate, pairs, tables, tolerances, two_sheets
 from handtouch.field import contact_law
+from handtouch.wire.status import ContactRadiusStatus
 
 VALUE_ROW = np.dtype(
     [
@@ -32,19 +35,19 @@ VALUE_ROW = np.dtype(
         ("cells", "<f8", 2),  # position in the pad's table, where the next tick starts from
         ("squared_misfit", "<f8"),  # of a point, see MAX_SQUARED_MISFIT
         ("is_bound", "<f8"),  # 1 where saturated channels leave the position open
+        ("contact_radius_m", "<f8"),
+        ("contact_radius_std_m", "<f8"),
+        ("contact_radius_status", "<f8"),  # ContactRadiusStatus
+        ("length_m", "<f8"),  # of its elongation, see `stages.elongation`
+        ("min_length_m", "<f8"),
+        ("max_length_m", "<f8"),
+        ("length_axis", "<f8", 3),
+        ("length_axis_std_rad", "<f8"),
     ]
 )
 VALUE_SLICES = slices_of(VALUE_ROW)
 """Layout of a row of values."""
-_X, _U, _RESIDUAL = VALUE_SLICES["xy"].start, VALUE_SLICES["pad_m"].start, VALUE_SLICES["residual"].start
-_POSITION, _NORMAL = VALUE_SLICES["position_m"].start, VALUE_SLICES["normal"].start
-_FORCE, _FORCE_STD = VALUE_SLICES["force_n"].start, VALUE_SLICES["force_std_n"].start
-_RESIDUAL_STD, _FORCE_STATUS = VALUE_SLICES["residual_std"].start, VALUE_SLICES["force_status"].start
-_COVARIANCE, _MOUNT = VALUE_SLICES["covariance_m2"].start, VALUE_SLICES["mount_covariance_m2"].start
-_PAD_NOISE, _CELLS = VALUE_SLICES["pad_noise_m2"].start, VALUE_SLICES["cells"].start
-_MISFIT, _IS_BOUND = VALUE_SLICES["squared_misfit"].start, VALUE_SLICES["is_bound"].start
-_COUNT = row_count(VALUE_ROW)
-VALUE_COUNT = _COUNT
+VALUE_COUNT = row_count(VALUE_ROW)
 PART_ROW = np.dtype(
     [
         ("position_m", "<f8", 3),
@@ -59,21 +62,38 @@ PART_ROW = np.dtype(
 )
 PART_SLICES = slices_of(PART_ROW)
 """Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
-_PART_POSITION, _PART_NORMAL = PART_SLICES["position_m"].start, PART_SLICES["normal"].start
-_PART_COVARIANCE, _PART_FORCE = PART_SLICES["covariance_m2"].start, PART_SLICES["force_n"].start
-_PART_FORCE_STD, _PART_ID = PART_SLICES["force_std_n"].start, PART_SLICES["id"].start
-_PART_PLACE, _PART_NEWEST = PART_SLICES["place"].start, PART_SLICES["newest_id"].start
-_PART_COUNT = row_count(PART_ROW)
-_PARTS_COUNT = 2 * _PART_COUNT
-PART_COUNT, PARTS_COUNT = _PART_COUNT, _PARTS_COUNT
-_MOUNT_COUNT = 5
-MOUNT_COUNT = _MOUNT_COUNT
-"""Values of a pad's mount."""
+PART_COUNT, PARTS_COUNT = row_count(PART_ROW), 2 * row_count(PART_ROW)
+MOUNT_ROW = np.dtype(
+    [
+        ("origin_m", "<f8", 3),  # of the pad on its link
+        ("position_variance_m2", "<f8"),  # of that along each axis
+        ("rotation_variance_rad2", "<f8"),  # and about it
+    ]
+)
+"""A pad's mount"""
+MOUNT_COUNT = row_count(MOUNT_ROW)
+MISFIT_ROW = np.dtype(
+    [
+        ("mean_square", "<f8"),  # running mean of the squared misfits of the contacts before
+        ("weighted_sum", "<f8"),  # of the last: sum of those of its samples, times the square of the current
+        ("weight_sum", "<f8"),  # sum of these squares
+    ]
+)
+"""Misfits of a pad's contacts"""
+MISFIT_COUNT = row_count(MISFIT_ROW)
 _NAN = float("nan")
-_FITTED, _BOUNDED = float(force.FITTED), float(force.BOUNDED)
+_FITTED, _BOUNDED, _WIDE = float(force.FITTED), float(force.BOUNDED), float(force.WIDE)
+_, _ESTIMATED, _ASSUMED, _CONTRADICTORY = map(float, ContactRadiusStatus)
 _BOUND_SIGMA = contact_law.BOUND_SIGMA
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
+_MIN_TURNED, _MIN_STEEPNESS, _MIN_DETERMINANT = 0.3, 1e-9, 1e-9
+_CUT_SPREAD, _CUT_ERROR = 0.68, 0.15
+_CUT_MORE, _CURVED_SPREADING = 1.0 - force.CUT_SPREADING, 0.125
+_CORNER_ERROR, _CORNER_RADII = 0.055, 1.2
+_CROWDING_ERROR, _CORNER_CROWDING, _CURVED_CROWDING, _CROWDING_STD = 0.02, 0.15, 0.06, 2.0 / 3.0
+"""Standard deviation of the way from the centre of the current to that of the contact, over it; and by
+pressures that aren't even, over `contact_tilt_std` (as of Hertz's, a third of it in the resistance)"""
 _TWO_PI, _INFINITY = 2.0 * math.pi, math.inf
 _MOTION_ALONG, _MOTION_ACROSS = 0.8, 0.3
 """Standard deviations of a position along and across the path, in what a contact moves in a schedule: by
@@ -82,34 +102,31 @@ _PART_MOTION = 2.0  # of one of two contacts that moves, in motions of the singl
 _PAIRED_CHANNELS = 4  # electrodes x0, xa, y0, yb
 _UNKNOWNS = 3  # of a contact: position and total
 _MIN_PEAK = 1.2  # largest current of a contact, relative to the reading of a saturated channel
-_MISFIT_COUNT = 3
-MISFIT_COUNT = _MISFIT_COUNT
-"""Values of a pad's misfits."""
 _MISFIT_CONTACTS, _MIN_LASTING_MISFIT = 8.0, 2.0
 """Contacts over which the misfit of a pad's contacts is averaged; mean that widens the covariance of later
 ones: 5 % of pads as stated have more, by contacts of seven shapes (`default`, tuning family)."""
 _UNIFORM_VARIANCE = 1.0 / 12.0  # of a value anywhere in a range, in squares of the range
+_MAX_VARIANCE = 1.0 / 3.0  # of a position anywhere on a side, estimated at its end, in squares of the side
 
 
 class ContactSolver:
-    """Solves contacts of the pads of a model; arrays are flat, with a row a pad.
+    """Solves contacts of the pads of a model.
 
-    electrodes: number c of channels of the pad that has most.
-    currents, weight: (pads c,) currents [A] and 1 / noise [1/A]; a pad reads as many as it has electrodes.
-    known: of gains and parts. gain_covariance: (pads c c,) of log gains.
-    offset_std: (pads,) of the sum of the currents, from the
-    baseline [A]; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
-    force is to be estimated. values: (pads VALUE_COUNT,), the result; NaN for a new contact, else the search
+    models, pad_tolerances, laws, surfaces: of each pad. known: of gains and parts. both: `TwoSheets` of the
+    pads with two sheets, None without any.
+
+    arrays: memory by name, flat, with a row a pad; a pad reads of its c channels, as the pad with most
+    electrodes has, as many as it has electrodes. currents, weight: (pads c,) currents [A] and 1 / noise
+    [1/A]. gain_covariance: (pads c c,) of log gains. offset_std_a: (pads,) of the sum of the currents, from
+    the baseline; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
+    force is to be estimated. values: (pads,) VALUE_ROWs, the result; NaN for a new contact, else the search
     begins at the position in it. pair_limits: (pads,) squared misfit of one contact from which on two are
     tried, infinite where they can't be resolved; moment_stds: (pads,) [m^2], that of an elongated contact,
-    see `tolerances.whiten_elongated`; parts: (pads PARTS_COUNT,), the two contacts, NaN if there is one.
-    saturated: (pads c,), 1 where a current is a lower bound; peak_currents: (pads,) largest current of an
-    electrode by the firmest contact [A]. mounts: (pads MOUNT_COUNT,) origin of each pad on its link [m], and
-    the variances of that along each axis [m^2] and about it [rad^2]. crowding: (pads,), 1 where currents
-    crowd towards electrodes. ampere_per_count, noise_squared: (pads c,), variances of the channels [counts^2]
-    as measured; where the stated noise is larger, that counts. misfits: (3 pads,), running mean of the
-    squared misfits of a pad's contacts; of the last contact those of its samples, each times the square of
-    its current, summed, and the sum of these squares.
+    see `tolerances.whiten_elongated`; parts: (2 pads,) PART_ROWs, of each pad two, NaN if there is one.
+    saturated: (pads c,), 1 where a current is a lower bound; peak_currents_a: (pads,) largest current of an
+    electrode by the firmest contact. mounts: (pads,) MOUNT_ROWs. misfits: (pads,) MISFIT_ROWs. crowding:
+    (pads,), 1 where currents crowd towards electrodes. ampere_per_count, noise_squared: (pads c,), variances
+    of the channels [counts^2] as measured; where the stated noise is larger, that counts.
     """
 
     def __init__(
@@ -118,49 +135,38 @@ class ContactSolver:
         pad_tolerances: list[tolerances.PadTolerances],
         laws: list[force.PadLaw],
         surfaces: list[tables.PadSurface],
-        stack: force.StackTable,
-        fit: locate.Fit,
-        placement: tables.Placement,
-        electrodes: int,
-        work: memoryview[float],
-        currents: memoryview[float],
-        weight: memoryview[float],
         known: tolerances.PartKnowledge,
-        gain_covariance: memoryview[float],
-        offset_std: memoryview[float],
-        force_requested: memoryview[int],
-        values: memoryview[float],
-        pair: pairs.PairFit,
-        pair_limits: memoryview[float],
-        moment_stds: memoryview[float],
-        parts: memoryview[float],
-        saturated: memoryview[int],
-        peak_currents: memoryview[float],
-        mounts: memoryview[float],
-        crowding: memoryview[int],
-        ampere_per_count: memoryview[float],
-        noise_squared: memoryview[float],
-        misfits: memoryview[float],
+        arrays: Mapping[str, Any],
+        both: Any = None,
     ) -> None:
-        self.misfits = misfits
-        self.ampere_per_count, self.noise_squared = ampere_per_count, noise_squared
-        self.mounts, self.crowding = mounts, crowding
-        self.saturated, self.peak_currents = saturated, peak_currents
-        self.were_two = False
-        self.pair, self.pair_limits, self.moment_stds, self.parts = pair, pair_limits, moment_stds, parts
         self.models, self.pad_tolerances = models, pad_tolerances
-        self.laws, self.surfaces = laws, surfaces
-        self.stack, self.fit, self.placement = stack, fit, placement
-        self.result = force.ForceResult()
+        self.laws, self.surfaces, self.known = laws, surfaces, known
+        self.both, self.has_both = both, both is not None
+        self.currents, self.weight, self.values = arrays["currents"], arrays["weight"], arrays["values"]
+        self.gain_covariance, self.offset_std_a = arrays["gain_covariance"], arrays["offset_std_a"]
+        self.force_requested, self.saturated = arrays["force_requested"], arrays["saturated"]
+        self.pair_limits, self.moment_stds = arrays["pair_limits"], arrays["moment_stds"]
+        self.parts, self.misfits = arrays["parts"], arrays["misfits"]
+        self.peak_currents_a, self.mounts = arrays["peak_currents_a"], arrays["mounts"]
+        self.crowding, self.noise_squared = arrays["crowding"], arrays["noise_squared"]
+        self.ampere_per_count = arrays["ampere_per_count"]
+        self.electrodes = n = len(self.currents) // len(models)
+        self.stack, self.fit = force.stack_table(), locate.Fit(n, max(pad.states for pad in pad_tolerances))
+        self.placement, self.pair = tables.Placement(), pairs.PairFit(n)
+        self.elongation, self.result = elongation.Elongation(n), force.ForceResult()
+        self.part_law = force.empty_law()
+        self.by_x, self.by_y = view_memory(np.zeros(n)), view_memory(np.zeros(n))
+        self.by_total, self.covariance = view_memory(np.zeros(n)), view_memory(np.zeros(9))
+        self.no_value = np.full(1, np.nan, VALUE_ROW).view(np.recarray)
+        self.is_by_both = self.contradicts = False  # force and radius of the last contact are by two sheets
+        self.were_two = False
+        self.pure = self.mixed = 0.0
+        # of the contact's centre: cells; ln of the spreading radius on the surface, its derivatives on the
+        # rectangle, square of its gradient; by how far the current's is from it, see `crowded_shift`
+        self.centre_s = self.centre_t = self.log_spreading_m = self.slope_x = self.slope_y = 0.0
+        self.gradient2 = self.shift = self.moved2 = self.scale2 = 0.0
+        self.straight_x = self.straight_y = 0.0
         self.moved_x = self.moved_y = 0.0  # in the course of a schedule
-        self.electrodes = electrodes
-        self.by_x, self.by_y, self.by_total = (
-            work[:electrodes], work[electrodes : 2 * electrodes], work[2 * electrodes : 3 * electrodes],
-        )  # fmt: skip
-        self.currents, self.weight = currents, weight
-        self.known, self.gain_covariance = known, gain_covariance
-        self.offset_std, self.force_requested = offset_std, force_requested
-        self.values = values
 
     def solve_contacts(self, pads: memoryview[int]) -> None:
         """Solve the contacts of these pads; a row is NaN where no contact explains the currents."""
@@ -170,11 +176,12 @@ class ContactSolver:
 
 def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
-    fit, table, values, parts = solver.fit, solver.models[pad], solver.values, solver.pad_tolerances[pad]
-    n, row, first, saturated = table.electrodes, pad * _COUNT, pad * solver.electrodes, 0
+    fit, table, parts = solver.fit, solver.models[pad], solver.pad_tolerances[pad]
+    n, first, saturated = table.electrodes, pad * solver.electrodes, 0
     fit.whitening.electrodes = n
-    last_x, last_y = values[row + _X], values[row + _X + 1]
-    offset2 = solver.offset_std[pad] * solver.offset_std[pad] / n
+    last_x, last_y = solver.values[pad].xy[0], solver.values[pad].xy[1]
+    last_radius_m = solver.values[pad].contact_radius_m
+    offset2 = solver.offset_std_a[pad] * solver.offset_std_a[pad] / n
     for i in range(n):
         weight, scale = solver.weight[first + i], solver.ampere_per_count[first + i]
         excess = solver.noise_squared[first + i] * scale * scale * weight * weight
@@ -187,7 +194,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
             saturated += 1
     if saturated:
         _estimate_saturated(solver, pad)
-    if values[row + _CELLS] != values[row + _CELLS]:  # a new contact
+    if solver.values[pad].cells[0] != solver.values[pad].cells[0]:  # a new contact
         _count_misfit(solver, pad)
     locate.locate(
         table,
@@ -196,26 +203,29 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
         solver.known,
         pad,
         solver.gain_covariance,
-        values[row + _CELLS],
-        values[row + _CELLS + 1],
+        solver.values[pad].cells[0],
+        solver.values[pad].cells[1],
     )
-    for i in range(_COUNT):
-        values[row + i] = _NAN
-    values[row + _IS_BOUND] = 1.0 if n - saturated < _UNKNOWNS else 0.0
+    solver.values[pad] = solver.no_value[0]
+    solver.values[pad].is_bound = 1.0 if n - saturated < _UNKNOWNS else 0.0
     solver.were_two = _forget_parts(solver, pad, last_x != last_x)
     if not fit.found:
         return
-    values[row + _CELLS], values[row + _CELLS + 1] = fit.s, fit.t
+    solver.values[pad].cells[0], solver.values[pad].cells[1] = fit.s, fit.t
     tables.place_contact(solver.surfaces[pad], solver.placement, fit.x, fit.y)
+    if n > _UNKNOWNS and not saturated:
+        _write_elongation(solver, pad)
     _propagate(solver, pad)
+    solver.is_by_both = False
+    _find_centre(solver, pad, solver.laws[pad])
     if solver.force_requested[pad]:
-        _estimate_force(solver, pad, 1.0)
-        if fit.cost > _MAX_SQUARED_MISFIT:
-            _span_two_patches(solver, pad)
-        if saturated:
-            _bound_force(solver, pad)
-    if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS and not saturated:
-        _add_extent(table, fit, values[row + _RESIDUAL])
+        if solver.has_both:
+            _estimate_both(solver, pad, last_radius_m, saturated)
+        if not solver.is_by_both:
+            _estimate_by_first(solver, pad, saturated)
+        _limit_force(solver, pad)
+    if fit.cost > _MAX_SQUARED_MISFIT and n == _PAIRED_CHANNELS and table.is_potential and not saturated:
+        _add_extent(table, fit, solver.values[pad].residual)
     solver.moved_x = solver.moved_y = 0.0
     if parts.states > 1 and last_x == last_x:
         lag = 1.0 * (parts.states - 1)
@@ -225,6 +235,83 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     _write_position(solver, pad)
     if fit.cost > _MAX_SQUARED_MISFIT and solver.pair_limits[pad] < _INFINITY and not saturated:
         _resolve_pair(solver, pad)
+
+
+def _write_elongation(solver: ContactSolver, pad: int) -> None:
+    """Write length and direction of the contact just located and placed."""
+    fit, found, at = solver.fit, solver.elongation, solver.placement
+    elongation.estimate_elongation(
+        found, solver.models[pad], fit, solver.pad_tolerances[pad], at.along_m * at.around_m
+    )
+    solver.values[pad].length_m, solver.values[pad].min_length_m = found.length_m, found.least_m
+    solver.values[pad].max_length_m = found.most_m
+    along, around = math.cos(found.angle) / at.along_m, math.sin(found.angle) / at.around_m
+    solver.values[pad].length_axis[0] = along * at.tx + around * at.wx
+    solver.values[pad].length_axis[1] = along * at.ty + around * at.wy
+    solver.values[pad].length_axis[2] = along * at.tz + around * at.wz
+    solver.values[pad].length_axis_std_rad = found.angle_std
+
+
+def _estimate_by_first(solver: ContactSolver, pad: int, saturated: int) -> None:
+    """Estimate the force by the first sheet alone, for radii as its table states them."""
+    fit = solver.fit
+    _estimate_force(solver, pad, 1.0)
+    if fit.cost > _MAX_SQUARED_MISFIT:
+        _span_two_patches(solver, pad)
+    if saturated:
+        _bound_force(solver, pad)
+    law, force_n = solver.laws[pad], solver.values[pad].force_n
+    if not force_n > 0.0:
+        return
+    log_radius = law.parameters[0].log_radius
+    if law.parameters[0].growth > 0.0:
+        log_radius += math.log(force_n) / 3.0
+    radius_m = math.exp(log_radius)
+    solver.values[pad].contact_radius_m = radius_m
+    solver.values[pad].contact_radius_std_m = radius_m * math.sqrt(law.parameters[0].radius_variance)
+    solver.values[pad].contact_radius_status = _ASSUMED
+    if solver.has_both and solver.contradicts:
+        solver.values[pad].contact_radius_status = _CONTRADICTORY
+        if solver.values[pad].force_status == _FITTED:
+            solver.values[pad].force_status = _WIDE
+
+
+def _estimate_both(solver: ContactSolver, pad: int, last_radius_m: float, saturated: int) -> None:
+    """Estimate force and radius by both sheets, where the pad has two and the second says something.
+
+    The value of the force is the first sheet's apparent one, as of pads with one sheet.
+    """
+    fit, both = solver.fit, solver.both
+    n, law = fit.whitening.electrodes, solver.laws[pad]
+    solver.contradicts = False
+    if both.numbers[pad] < 0:
+        return
+    _find_spreading(solver, pad, 1.0)
+    two_sheets.estimate_both(
+        both,
+        pad,
+        law,
+        solver.result,
+        0.0 if saturated else fit.total,
+        math.sqrt(fit.var_total),
+        solver.log_spreading_m,
+        0.0 if solver.result.cut < 0.0 else solver.gradient2,  # over an edge, the radius decides how far
+        solver.pure,
+        solver.mixed,
+        force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
+        last_radius_m,
+    )
+    solver.contradicts = both.contradicts
+    if not both.is_used:
+        return
+    solver.is_by_both = True
+    solver.values[pad].force_n, solver.values[pad].force_std_n = solver.result.force_n, solver.result.std_n
+    solver.values[pad].force_status = 1.0 * solver.result.status
+    solver.values[pad].contact_radius_m, solver.values[pad].contact_radius_std_m = (
+        both.radius_m,
+        both.radius_std_m,
+    )
+    solver.values[pad].contact_radius_status = _ESTIMATED
 
 
 def _estimate_saturated(solver: ContactSolver, pad: int) -> None:
@@ -240,7 +327,7 @@ def _estimate_saturated(solver: ContactSolver, pad: int) -> None:
         if not solver.saturated[first + i]:
             continue
         least = solver.currents[first + i]
-        greatest = max(solver.peak_currents[pad], _MIN_PEAK * least)
+        greatest = max(solver.peak_currents_a[pad], _MIN_PEAK * least)
         noise = 1.0 / fit.weight[i]
         current = 2.0 * least * greatest / (least + greatest)
         relative = 2.0 * (greatest - least) / (greatest + least)  # width of the range of the inverse
@@ -252,31 +339,45 @@ def _estimate_saturated(solver: ContactSolver, pad: int) -> None:
 def _bound_force(solver: ContactSolver, pad: int) -> None:
     """Replace the force of a contact with saturated channels by a lower bound: that of their lowest currents,
     less two standard deviations of its logarithm."""
-    fit, values, row, first = solver.fit, solver.values, pad * _COUNT, pad * solver.electrodes
+    fit, first = solver.fit, pad * solver.electrodes
     total = variance = 0.0
     for i in range(fit.whitening.electrodes):
         total += solver.currents[first + i]
         variance += 1.0 / (solver.weight[first + i] * solver.weight[first + i])
-    fit.total, fit.var_total = total, variance
+    share = locate.channel_sum(solver.models[pad], fit)
+    fit.total, fit.var_total = total / share, variance / (share * share)
     fit.cov_x_total = fit.cov_y_total = 0.0
+    _find_centre(solver, pad, solver.laws[pad])
     _estimate_force(solver, pad, 1.0)
-    if values[row + _FORCE_STATUS] != _BOUNDED and values[row + _FORCE] > 0.0:
-        relative = values[row + _FORCE_STD] / values[row + _FORCE]
-        values[row + _FORCE] *= math.exp(-_BOUND_SIGMA * math.sqrt(math.log(1.0 + relative * relative)))
-        values[row + _FORCE_STD] = _INFINITY
-        values[row + _FORCE_STATUS] = _BOUNDED
+    if solver.values[pad].force_status != _BOUNDED and solver.values[pad].force_n >= 0.0:
+        if solver.values[pad].force_n > 0.0:
+            relative = solver.values[pad].force_std_n / solver.values[pad].force_n
+            solver.values[pad].force_n *= math.exp(
+                -_BOUND_SIGMA * math.sqrt(math.log(1.0 + relative * relative))
+            )
+        solver.values[pad].force_std_n = _INFINITY
+        solver.values[pad].force_status = _BOUNDED
+
+
+def _limit_force(solver: ContactSolver, pad: int) -> None:
+    """Limit a force, of two patches or a lower bound, to the greatest of a contact."""
+    force_n, greatest_n = solver.values[pad].force_n, force.max_force_n(solver.laws[pad])
+    if force_n > greatest_n:
+        solver.values[pad].force_n = greatest_n
 
 
 def _forget_parts(solver: ContactSolver, pad: int, is_new: bool) -> bool:
     """Write NaN for the two contacts of a pad; return True if there were two in its last sample. Their places
     stay, unless the contact is new."""
-    parts, row = solver.parts, pad * _PARTS_COUNT
-    were_two = parts[row] == parts[row]
-    for k in range(2):
-        for i in range(_PART_ID):
-            parts[row + k * _PART_COUNT + i] = _NAN
+    were_two = solver.parts[2 * pad].position_m[0] == solver.parts[2 * pad].position_m[0]
+    for row in range(2 * pad, 2 * pad + 2):
+        for i in range(3):
+            solver.parts[row].position_m[i] = solver.parts[row].normal[i] = _NAN
+        for i in range(9):
+            solver.parts[row].covariance_m2[i] = _NAN
+        solver.parts[row].force_n = solver.parts[row].force_std_n = _NAN
         if is_new:
-            parts[row + k * _PART_COUNT + _PART_PLACE] = _NAN
+            solver.parts[row].place[0] = _NAN
     return were_two and not is_new
 
 
@@ -286,41 +387,45 @@ def _order_parts(solver: ContactSolver, pad: int) -> int:
     It keeps that one's id. After samples with one contact it must also be nearer than half of the distance
     between the two; else it is another object's.
     """
-    pair, table, parts, row = solver.pair, solver.models[pad], solver.parts, pad * _PARTS_COUNT
+    pair, table = solver.pair, solver.models[pad]
     x0 = locate.coordinate(table.nodes_x, table.cells, pair.place[0])
     y0 = locate.coordinate(table.nodes_y, table.cells, pair.place[1])
     x1 = locate.coordinate(table.nodes_x, table.cells, pair.place[2])
     y1 = locate.coordinate(table.nodes_y, table.cells, pair.place[3])
-    first, second = row + _PART_PLACE, row + _PART_COUNT + _PART_PLACE
-    kept = _squared_distance(parts, first, x0, y0) + _squared_distance(parts, second, x1, y1)
-    turned = _squared_distance(parts, first, x1, y1) + _squared_distance(parts, second, x0, y0)
+    first, second = 2 * pad, 2 * pad + 1
+    kept = _squared_distance(solver.parts, first, x0, y0) + _squared_distance(solver.parts, second, x1, y1)
+    turned = _squared_distance(solver.parts, first, x1, y1) + _squared_distance(solver.parts, second, x0, y0)
     begin = 1 if turned < kept else 0
     if begin:
         x0, y0, x1, y1 = x1, y1, x0, y0
     near2 = 0.25 * ((x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0))
     near2 = _INFINITY if solver.were_two else near2
-    _name_part(parts, row, first, x0, y0, near2)
-    _name_part(parts, row, second, x1, y1, near2)
+    if not _squared_distance(solver.parts, first, x0, y0) < near2:
+        _name_part(solver.parts, first, first)
+    if not _squared_distance(solver.parts, second, x1, y1) < near2:
+        _name_part(solver.parts, second, first)
+    solver.parts[first].place[0], solver.parts[first].place[1] = x0, y0
+    solver.parts[second].place[0], solver.parts[second].place[1] = x1, y1
     return begin
 
 
-def _squared_distance(parts: memoryview[float], at: int, x: float, y: float) -> float:
-    """Return the squared distance of (x, y) from a place in the parts; NaN if that is none."""
-    return (x - parts[at]) * (x - parts[at]) + (y - parts[at + 1]) * (y - parts[at + 1])
+def _squared_distance(parts: RowArray, row: int, x: float, y: float) -> float:
+    """Return the squared distance of (x, y) from the place of a part; NaN if that is none."""
+    x -= parts[row].place[0]
+    y -= parts[row].place[1]
+    return x * x + y * y
 
 
-def _name_part(parts: memoryview[float], row: int, at: int, x: float, y: float, near2: float) -> None:
-    """Write place and id of one of two contacts; another id unless it is near its last place."""
-    if not _squared_distance(parts, at, x, y) < near2:
-        newest = parts[row + _PART_NEWEST]
-        newest = newest + 1.0 if newest == newest else 1.0
-        parts[row + _PART_NEWEST] = parts[at + _PART_ID - _PART_PLACE] = newest
-    parts[at], parts[at + 1] = x, y
+def _name_part(parts: RowArray, row: int, first: int) -> None:
+    """Write another id of one of two contacts, whose pad's newest id is in the first of both."""
+    newest = parts[first].newest_id
+    newest = newest + 1.0 if newest == newest else 1.0
+    parts[first].newest_id = parts[row].id = newest
 
 
 def _resolve_pair(solver: ContactSolver, pad: int) -> None:
     """Write the two contacts of a pad, where the currents support two rather than one."""
-    fit, pair, table, parts = solver.fit, solver.pair, solver.models[pad], solver.parts
+    fit, pair, table = solver.fit, solver.pair, solver.models[pad]
     scale2 = solver.placement.scale_m * solver.placement.scale_m
     pairs.fit_pair(
         table,
@@ -335,9 +440,13 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
     )
     if not pair.found:
         return
+    solver.values[pad].length_m = solver.values[pad].min_length_m = solver.values[pad].max_length_m = _NAN
+    for i in range(3):
+        solver.values[pad].length_axis[i] = _NAN
+    solver.values[pad].length_axis_std_rad = _NAN
     begin = _order_parts(solver, pad)
     for k in range(2):
-        row = pad * _PARTS_COUNT + (k ^ begin) * _PART_COUNT
+        row = 2 * pad + (k ^ begin)
         fit.s, fit.t = pair.place[2 * k], pair.place[2 * k + 1]
         fit.x = locate.coordinate(table.nodes_x, table.cells, fit.s)
         fit.y = locate.coordinate(table.nodes_y, table.cells, fit.t)
@@ -349,15 +458,15 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
         at = solver.placement
         if solver.force_requested[pad]:
             _estimate_part_force(solver, pad, k, row)
-        parts[row + _PART_POSITION], parts[row + _PART_NORMAL] = at.px, at.nx
-        parts[row + _PART_POSITION + 1], parts[row + _PART_NORMAL + 1] = at.py, at.ny
-        parts[row + _PART_POSITION + 2], parts[row + _PART_NORMAL + 2] = at.pz, at.nz
+        solver.parts[row].position_m[0], solver.parts[row].normal[0] = at.px, at.nx
+        solver.parts[row].position_m[1], solver.parts[row].normal[1] = at.py, at.ny
+        solver.parts[row].position_m[2], solver.parts[row].normal[2] = at.pz, at.nz
         _add_motion(solver, _PART_MOTION)
         _add_size(solver, pad)
         _add_overhang(solver, pad)
-        _write_row(parts, row + _PART_COVARIANCE, fit, at, at.tx, at.wx)
-        _write_row(parts, row + _PART_COVARIANCE + 3, fit, at, at.ty, at.wy)
-        _write_row(parts, row + _PART_COVARIANCE + 6, fit, at, at.tz, at.wz)
+        _find_covariance(solver)
+        for i in range(9):
+            solver.parts[row].covariance_m2[i] = solver.covariance[i]
 
 
 def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> None:
@@ -383,8 +492,10 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> N
     variance += 2.0 * slope_x * slope_y * fit.cov_xy
     with_x, with_y = pair.with_total[2 * k], pair.with_total[2 * k + 1]
     variance += 2.0 * whole * (slope_x * with_x + slope_y * with_y)
-    scale_m = solver.placement.scale_m
-    force_n = 0.0
+    scale_m, gradient2, force_n = solver.placement.scale_m, 0.0, 0.0
+    if solver.crowding[pad]:
+        gradient2 = (slope_x * slope_x + slope_y * slope_y) / (scale_m * scale_m)
+    solver.result.moved = solver.result.cut = 0.0  # R is that at the centre of the current
     for step in range(2):
         force.estimate_force(
             solver.stack,
@@ -393,7 +504,7 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> N
             total,
             math.sqrt(pair.var_total[k]),
             pair.spreading[k] + math.log(scale_m),
-            (slope_x * slope_x + slope_y * slope_y) / (scale_m * scale_m),
+            gradient2,
             variance,
             resistors + step * mutual,
         )
@@ -402,14 +513,14 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> N
         if step == 0:
             force_n = solver.result.force_n
     change = 0.5 * (solver.result.force_n - force_n)
-    solver.parts[row + _PART_FORCE] = solver.result.force_n
+    solver.parts[row].force_n = solver.result.force_n
     std_n = solver.result.std_n
-    solver.parts[row + _PART_FORCE_STD] = math.sqrt(std_n * std_n + change * change)
+    solver.parts[row].force_std_n = math.sqrt(std_n * std_n + change * change)
 
 
 def _propagate(solver: ContactSolver, pad: int) -> None:
     """Compute residual and derivatives by the currents; inflate the covariance for misfit."""
-    fit, values, row = solver.fit, solver.values, pad * _COUNT
+    fit = solver.fit
     n, total, pair, modelled, noise = fit.whitening.electrodes, fit.total, 0.0, 0.0, 0.0
     # derivatives of (x, y, total) by each whitened current, from slopes by cell; then by each current
     per_x, per_y = total / fit.scale_x, total / fit.scale_y
@@ -441,11 +552,11 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
         if i < 2:
             by += 1.0 / total
         noise += (by / fit.weight[i]) * (by / fit.weight[i])
-    if n == _PAIRED_CHANNELS:
-        values[row + _RESIDUAL], values[row + _RESIDUAL_STD] = residual, math.sqrt(noise)
     table = solver.models[pad]
+    if n == _PAIRED_CHANNELS and table.is_potential:
+        solver.values[pad].residual, solver.values[pad].residual_std = residual, math.sqrt(noise)
     fit.cost *= table.misfit_scale
-    values[row + _MISFIT] = fit.cost
+    solver.values[pad].squared_misfit = fit.cost
     _write_pad_noise(solver, pad)
     _widen_by_misfit(solver, pad)
 
@@ -453,25 +564,26 @@ def _propagate(solver: ContactSolver, pad: int) -> None:
 def _widen_by_misfit(solver: ContactSolver, pad: int) -> None:
     """Widen the covariance by this contact's misfit, or by those of the pad's last contacts, which show that
     its parts aren't as stated. Where two contacts are told apart, misfits are no evidence of that."""
-    fit, spread, at = solver.fit, 1.0, _MISFIT_COUNT * pad
-    if solver.misfits[at] > _MIN_LASTING_MISFIT:
-        spread = solver.misfits[at]
+    fit, spread = solver.fit, 1.0
+    if solver.misfits[pad].mean_square > _MIN_LASTING_MISFIT:
+        spread = solver.misfits[pad].mean_square
     spread = max(spread, 1.0 + fit.cost - _MAX_SQUARED_MISFIT)
     if spread > 1.0:
         fit.var_x *= spread
         fit.var_y *= spread
         fit.cov_xy *= spread
     if not solver.pair_limits[pad] < _INFINITY:
-        solver.misfits[at + 1] += fit.total * fit.total * min(fit.cost, _MAX_SQUARED_MISFIT)
-        solver.misfits[at + 2] += fit.total * fit.total
+        solver.misfits[pad].weighted_sum += fit.total * fit.total * min(fit.cost, _MAX_SQUARED_MISFIT)
+        solver.misfits[pad].weight_sum += fit.total * fit.total
 
 
 def _count_misfit(solver: ContactSolver, pad: int) -> None:
     """Add the misfit of a pad's contact before to the running mean of its contacts."""
-    at, misfits = _MISFIT_COUNT * pad, solver.misfits
-    if misfits[at + 2] > 0.0:
-        misfits[at] += (misfits[at + 1] / misfits[at + 2] - misfits[at]) / _MISFIT_CONTACTS
-        misfits[at + 1] = misfits[at + 2] = 0.0
+    mean, weight = solver.misfits[pad].mean_square, solver.misfits[pad].weight_sum
+    if weight > 0.0:
+        mean += (solver.misfits[pad].weighted_sum / weight - mean) / _MISFIT_CONTACTS
+        solver.misfits[pad].mean_square = mean
+        solver.misfits[pad].weighted_sum = solver.misfits[pad].weight_sum = 0.0
 
 
 def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> None:
@@ -497,8 +609,13 @@ def _add_extent(table: locate.ModelTable, fit: locate.Fit, residual: float) -> N
 
 
 def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
-    """Write the covariance of the arc lengths from channel noise alone: the larger of stated and measured."""
-    n, values, row = solver.fit.whitening.electrodes, solver.values, pad * _COUNT
+    """Write the covariance of the arc lengths from channel noise alone: the larger of stated and measured.
+
+    Of a coordinate that no current determines, as on an edge, it is the whole variance; none is beyond the
+    pad.
+    """
+    fit, table = solver.fit, solver.models[pad]
+    n = solver.fit.whitening.electrodes
     first, xx, xy, yy = pad * solver.electrodes, 0.0, 0.0, 0.0
     for i in range(n):
         noise, scale = 1.0 / solver.weight[first + i], solver.ampere_per_count[first + i]
@@ -509,10 +626,33 @@ def _write_pad_noise(solver: ContactSolver, pad: int) -> None:
         xx += x * x
         xy += x * y
         yy += y * y
+    if not (xx > 0.0 and yy > 0.0):
+        xy = 0.0
+        xx = xx if xx > 0.0 else fit.var_x
+        yy = yy if yy > 0.0 else fit.var_y
+    shrink_x = _shrinking(xx, table.side_x)
+    shrink_y = _shrinking(yy, table.side_y)
+    xx *= shrink_x * shrink_x
+    xy *= shrink_x * shrink_y
+    yy *= shrink_y * shrink_y
     along, around = solver.placement.along_m, solver.placement.around_m
-    values[row + _PAD_NOISE] = xx * along * along
-    values[row + _PAD_NOISE + 1] = xy * along * around
-    values[row + _PAD_NOISE + 2] = yy * around * around
+    solver.values[pad].pad_noise_m2[0] = xx * along * along
+    solver.values[pad].pad_noise_m2[1] = xy * along * around
+    solver.values[pad].pad_noise_m2[2] = yy * around * around
+
+
+def _shrinking(variance: float, side: float) -> float:
+    """Return the factor by which a deviation shrinks to that of a contact anywhere on a side."""
+    limit = _MAX_VARIANCE * side * side
+    return math.sqrt(limit / variance) if variance > limit else 1.0
+
+
+def _limit_to_pad(fit: locate.Fit, table: locate.ModelTable) -> None:
+    """Limit the covariance to that of a contact anywhere on the pad."""
+    shrink_x, shrink_y = _shrinking(fit.var_x, table.side_x), _shrinking(fit.var_y, table.side_y)
+    fit.var_x *= shrink_x * shrink_x
+    fit.var_y *= shrink_y * shrink_y
+    fit.cov_xy *= shrink_x * shrink_y
 
 
 def _span_two_patches(solver: ContactSolver, pad: int) -> None:
@@ -520,34 +660,96 @@ def _span_two_patches(solver: ContactSolver, pad: int) -> None:
 
     They are the likelier the larger the misfit; as likely as one from twice its limit on.
     """
-    values, row, chance = solver.values, pad * _COUNT, 0.5
+    chance = 0.5
     chance *= min(solver.fit.cost / _MAX_SQUARED_MISFIT - 1.0, 1.0)
-    one, one_std, status = values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS]
+    one, one_std, status = (
+        solver.values[pad].force_n,
+        solver.values[pad].force_std_n,
+        solver.values[pad].force_status,
+    )
     _estimate_force(solver, pad, 0.5)
-    two, two_std = 2.0 * values[row + _FORCE], 2.0 * values[row + _FORCE_STD]
-    if status == _FITTED and values[row + _FORCE_STATUS] == _FITTED:
+    two, two_std = 2.0 * solver.values[pad].force_n, 2.0 * solver.values[pad].force_std_n
+    if status == _FITTED and solver.values[pad].force_status == _FITTED:
         variance = (1.0 - chance) * one_std * one_std + chance * two_std * two_std
         one_std = math.sqrt(variance + chance * (1.0 - chance) * (two - one) * (two - one))
         one += chance * (two - one)
     elif status == _BOUNDED:
-        if values[row + _FORCE_STATUS] == _FITTED:
+        if solver.values[pad].force_status == _FITTED:
             two -= _BOUND_SIGMA * two_std
         one += 2.0 * chance * (min(one, max(two, 0.0)) - one)
-    values[row + _FORCE], values[row + _FORCE_STD], values[row + _FORCE_STATUS] = one, one_std, status
+    solver.values[pad].force_n, solver.values[pad].force_std_n, solver.values[pad].force_status = (
+        one,
+        one_std,
+        status,
+    )
+
+
+def _find_centre(solver: ContactSolver, pad: int, law: force.PadLaw) -> None:
+    """Find the centre of the contact from that of its current, and what surrounds it; without crowding they
+    are one."""
+    fit, table, at = solver.fit, solver.models[pad], solver.placement
+    n, result, is_crowded = fit.whitening.electrodes, solver.result, solver.crowding[pad] != 0
+    log_scale, parts = math.log(at.scale_m), solver.pad_tolerances[pad]
+    solver.centre_s, solver.centre_t = fit.s, fit.t
+    solver.log_spreading_m = fit.raw[n] + log_scale
+    solver.slope_x = fit.raw[2 * n + 1] / fit.scale_x + at.slope_x
+    solver.slope_y = fit.raw[3 * n + 2] / fit.scale_y + at.slope_y
+    solver.gradient2 = solver.shift = solver.moved2 = 0.0
+    if not is_crowded and parts.tilt_std == 0.0:
+        return
+    resistors = force.series_resistance(law, solver.currents, pad * solver.electrodes, n)
+    force.find_crowding(solver.stack, law, result, fit.total, solver.log_spreading_m, resistors)
+    if not is_crowded:
+        return
+    solver.scale2 = at.scale_m * at.scale_m
+    gradient2 = (solver.slope_x * solver.slope_x + solver.slope_y * solver.slope_y) / solver.scale2
+    shift = force.crowded_shift(result, solver.log_spreading_m, gradient2)
+    solver.moved2 = shift * shift * gradient2
+    # the gradient is that at the contact's centre: first as if beside a straight edge, inside or over it
+    whole = 0.5 * result.turning * result.square
+    near = 2.0 * whole / (1.0 + math.sqrt(1.0 + 4.0 * whole * gradient2))
+    near = min(near, shift / max(1.0 - shift * gradient2, _MIN_TURNED)) / solver.scale2
+    step_x, step_y = near * solver.slope_x, near * solver.slope_y
+    solver.centre_s = locate.clamp(table, fit.s + step_x / fit.scale_x)
+    solver.centre_t = locate.clamp(table, fit.t + step_y / fit.scale_y)
+    locate.read_beside(table, fit, solver.centre_s, solver.centre_t)
+    growth = at.slope_x * step_x + at.slope_y * step_y  # of the scale's logarithm
+    length_x = locate.cell_length(table.nodes_x, table.cells, solver.centre_s)
+    length_y = locate.cell_length(table.nodes_y, table.cells, solver.centre_t)
+    solver.log_spreading_m = fit.beside[n] + log_scale + growth
+    solver.slope_x = fit.beside[2 * n + 1] / length_x + at.slope_x
+    solver.slope_y = fit.beside[3 * n + 2] / length_y + at.slope_y
+    solver.scale2 *= math.exp(growth)  # half way
+    slope2 = solver.slope_x * solver.slope_x + solver.slope_y * solver.slope_y
+    solver.gradient2 = slope2 / solver.scale2
+    solver.shift = force.crowded_shift(result, solver.log_spreading_m, solver.gradient2)
+
+
+def _find_spreading(solver: ContactSolver, pad: int, share: float) -> None:
+    """Set what the estimate of the force needs of the position: the variance `pure` of ln of the spreading
+    radius, and its covariance `mixed` with the stack factor by the total."""
+    fit, law, surface = solver.fit, solver.laws[pad], solver.surfaces[pad]
+    # the stack factor is whole / total - ln R(x, y): its variance beyond that of the total alone
+    solver.pure = solver.mixed = 0.0
+    if solver.gradient2 > 0.0:  # R in the middle of a contact isn't the mean over it on a curved surface
+        curved = _CURVED_SPREADING * surface.curvature * solver.result.square
+        solver.pure = curved * curved
+    if fit.var_x < 1e300 and fit.var_y < 1e300:
+        whole = force.whole_factor(law, share * fit.total) / fit.total
+        variance = solver.slope_x * solver.slope_x * fit.var_x + solver.slope_y * solver.slope_y * fit.var_y
+        solver.pure += variance + 2.0 * solver.slope_x * solver.slope_y * fit.cov_xy
+        solver.mixed = whole * (solver.slope_x * fit.cov_x_total + solver.slope_y * fit.cov_y_total)
 
 
 def _estimate_force(solver: ContactSolver, pad: int, share: float) -> None:
-    fit, values, row = solver.fit, solver.values, pad * _COUNT
+    fit = solver.fit
     n, law = fit.whitening.electrodes, solver.laws[pad]
-    log_spreading_m = fit.raw[n] + math.log(solver.placement.scale_m)
-    # the stack factor is whole / total - ln R(x, y): its variance beyond that of the total alone
-    slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
-    variance = 0.0
-    if fit.var_x < 1e300 and fit.var_y < 1e300:
-        whole = force.whole_factor(law, share * fit.total) / fit.total
-        variance = slope_x * slope_x * fit.var_x + slope_y * slope_y * fit.var_y
-        variance += 2.0 * slope_x * slope_y * fit.cov_xy
-        variance += 2.0 * whole * (slope_x * fit.cov_x_total + slope_y * fit.cov_y_total)
+    _find_spreading(solver, pad, share)
+    log_spreading_m = solver.log_spreading_m
+    if solver.gradient2 > 0.0 and solver.result.cut < 0.0:
+        force.set_part(solver.part_law, law, solver.result.cut)
+        law = solver.part_law
+        log_spreading_m += _CUT_MORE * solver.result.cut
     force.estimate_force(
         solver.stack,
         law,
@@ -555,71 +757,112 @@ def _estimate_force(solver: ContactSolver, pad: int, share: float) -> None:
         share * fit.total,
         share * math.sqrt(fit.var_total),
         log_spreading_m,
-        (slope_x * slope_x + slope_y * slope_y) / (solver.placement.scale_m * solver.placement.scale_m),
-        variance,
+        solver.gradient2,
+        solver.pure + 2.0 * solver.mixed,
         force.series_resistance(law, solver.currents, pad * solver.electrodes, n) / share,
     )
-    values[row + _FORCE], values[row + _FORCE_STD] = solver.result.force_n, solver.result.std_n
-    values[row + _FORCE_STATUS] = 1.0 * solver.result.status
+    solver.values[pad].force_n, solver.values[pad].force_std_n = solver.result.force_n, solver.result.std_n
+    solver.values[pad].force_status = 1.0 * solver.result.status
 
 
 def _correct_crowding(solver: ContactSolver, pad: int) -> None:
     """Move the position from the centre of the current to that of the contact; add the covariance of that,
     and of the centre of a pressure that isn't even."""
     fit, table, at = solver.fit, solver.models[pad], solver.placement
-    n, law, result, parts = (
-        fit.whitening.electrodes,
-        solver.laws[pad],
-        solver.result,
-        solver.pad_tolerances[pad],
-    )
-    slope_x, slope_y = fit.raw[2 * n + 1] / fit.scale_x, fit.raw[3 * n + 2] / fit.scale_y
-    scale2 = at.scale_m * at.scale_m
-    gradient2 = (slope_x * slope_x + slope_y * slope_y) / scale2
-    force.find_crowding(
-        solver.stack,
-        law,
-        result,
-        fit.total,
-        fit.raw[n] + math.log(at.scale_m),
-        gradient2,
-        force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
-    )
+    result, parts = solver.result, solver.pad_tolerances[pad]
+    if solver.is_by_both:
+        _find_centre(solver, pad, solver.both.near)
     spread = parts.tilt_std * parts.tilt_std * result.tilt_m * result.tilt_m
-    if solver.crowding[pad]:  # an elongated contact moves more or less, and aside
-        moved = parts.moment_std * result.shift
-        spread += moved * moved * gradient2
+    # an elongated contact moves more or less, and aside
+    spread += parts.moment_std * parts.moment_std * solver.moved2
     fit.var_x += spread / (at.along_m * at.along_m)
     fit.var_y += spread / (at.around_m * at.around_m)
     if not solver.crowding[pad]:
         return
-    std_x, std_y = result.shift_std / scale2 * slope_x, result.shift_std / scale2 * slope_y
+    shift, scale2 = solver.shift, solver.scale2
+    # 2 beside a straight edge, 1 in a corner; how far the centre is from the edge, in radii
+    spreading_m = math.exp(solver.log_spreading_m)
+    steepness = spreading_m * math.sqrt(solver.gradient2)
+    inside = spreading_m / math.sqrt(2.0 * max(steepness, _MIN_STEEPNESS) * result.square)
+    cornered = max(2.0 - steepness, 0.0)
+    uneven, own = _CROWDING_STD * parts.tilt_std, _CROWDING_ERROR
+    own += _CORNER_CROWDING * cornered / max(inside * inside, 1.0)
+    std = shift * math.sqrt(uneven * uneven + own * own)
+    std = math.sqrt(result.shift_std * result.shift_std + std * std) / scale2
+    x, y = fit.x + shift / scale2 * solver.slope_x, fit.y + shift / scale2 * solver.slope_y
     if fit.var_x < 1e300 and fit.var_y < 1e300:
-        fit.var_x += std_x * std_x
-        fit.var_y += std_y * std_y
-        fit.cov_xy += std_x * std_y
-    x = max(0.0, min(table.side_x, fit.x + result.shift / scale2 * slope_x))
-    y = max(0.0, min(table.side_y, fit.y + result.shift / scale2 * slope_y))
+        fit.var_x += std * std * solver.slope_x * solver.slope_x
+        fit.var_y += std * std * solver.slope_y * solver.slope_y
+        fit.cov_xy += std * std * solver.slope_x * solver.slope_y
+        curved = _CURVED_CROWDING * shift / scale2
+        left_out = _CORNER_ERROR * cornered * max(_CORNER_RADII - inside, 0.0)
+        left_out *= left_out * result.square / scale2
+        fit.var_x += curved * curved * at.slope_x * at.slope_x + left_out
+        fit.var_y += curved * curved * at.slope_y * at.slope_y + left_out
+    if inside < 1.0:
+        _straighten(solver, parts, inside, scale2)
+        x += solver.straight_x
+        y += solver.straight_y
+        fit.var_x += _CUT_ERROR * _CUT_ERROR * solver.straight_x * solver.straight_x
+        fit.var_y += _CUT_ERROR * _CUT_ERROR * solver.straight_y * solver.straight_y
+    x, y = max(0.0, min(table.side_x, x)), max(0.0, min(table.side_y, y))
     if x != fit.x or y != fit.y:
         fit.x, fit.y = x, y
         tables.place_contact(solver.surfaces[pad], at, x, y)
 
 
+def _straighten(solver: ContactSolver, parts: tolerances.PadTolerances, inside: float, scale2: float) -> None:
+    """Find how far a position is off by the shape of a contact over the edge: a disc that an edge cuts
+    spreads its current farther along it than across.
+
+    inside: how far the centre of the part on the pad is from the edge, in radii; `slope_x` and `slope_y`
+    there, whose direction is across.
+    """
+    fit, n, square = solver.fit, solver.fit.whitening.electrodes, solver.result.square
+    # as a variance along the edge: of second and third moments, which a straight edge weighs by its distance
+    longer = _CUT_SPREAD * square * inside * (1.0 - inside) * math.sqrt(1.0 - inside) / scale2
+    along, across = solver.slope_x * solver.slope_x, solver.slope_y * solver.slope_y
+    longer *= 0.5 / (along + across)
+    by_xx, by_xy = longer * (along - across), longer * 2.0 * solver.slope_x * solver.slope_y
+    tolerances.read_second_derivatives(fit.whitening, parts, solver.centre_s, solver.centre_t)
+    for i in range(n):
+        change = tolerances.second_derivative(fit.whitening, parts, i, by_xx, by_xy)
+        fit.data[i] = fit.weight[i] * change
+    tolerances.apply_whitening(fit.whitening, fit.data, 0, fit.scaled)
+    gradient_x = gradient_y = solver.straight_x = solver.straight_y = 0.0
+    for i in range(n):
+        gradient_x += fit.slope_x[i] * fit.scaled[i]
+        gradient_y += fit.slope_y[i] * fit.scaled[i]
+    determinant = fit.xx * fit.yy - fit.xy * fit.xy
+    if determinant > _MIN_DETERMINANT * fit.xx * fit.yy:
+        solver.straight_x = fit.scale_x * (fit.yy * gradient_x - fit.xy * gradient_y) / determinant
+        solver.straight_y = fit.scale_y * (fit.xx * gradient_y - fit.xy * gradient_x) / determinant
+
+
 def _write_position(solver: ContactSolver, pad: int) -> None:
     """Write position, normal and covariance; NaN what the currents don't determine."""
-    fit, at, values, row = solver.fit, solver.placement, solver.values, pad * _COUNT
+    fit, at = solver.fit, solver.placement
     if not fit.var_x < 1e300 or not fit.var_y < 1e300:
         return
-    values[row + _X], values[row + _X + 1] = fit.x, fit.y
-    values[row + _U], values[row + _U + 1] = at.u_m, at.v_m
-    values[row + _POSITION], values[row + _POSITION + 1], values[row + _POSITION + 2] = at.px, at.py, at.pz
-    values[row + _NORMAL], values[row + _NORMAL + 1], values[row + _NORMAL + 2] = at.nx, at.ny, at.nz
+    solver.values[pad].xy[0], solver.values[pad].xy[1] = fit.x, fit.y
+    solver.values[pad].pad_m[0], solver.values[pad].pad_m[1] = at.u_m, at.v_m
+    solver.values[pad].position_m[0], solver.values[pad].position_m[1], solver.values[pad].position_m[2] = (
+        at.px,
+        at.py,
+        at.pz,
+    )
+    solver.values[pad].normal[0], solver.values[pad].normal[1], solver.values[pad].normal[2] = (
+        at.nx,
+        at.ny,
+        at.nz,
+    )
     _add_motion(solver, 1.0)
     _add_size(solver, pad)
     _add_overhang(solver, pad)
-    _write_row(values, row + _COVARIANCE, fit, at, at.tx, at.wx)
-    _write_row(values, row + _COVARIANCE + 3, fit, at, at.ty, at.wy)
-    _write_row(values, row + _COVARIANCE + 6, fit, at, at.tz, at.wz)
+    _limit_to_pad(fit, solver.models[pad])
+    _find_covariance(solver)
+    for i in range(9):
+        solver.values[pad].covariance_m2[i] = solver.covariance[i]
     _write_mount(solver, pad)
 
 
@@ -628,16 +871,17 @@ def _write_mount(solver: ContactSolver, pad: int) -> None:
 
     A rotation error of s about each axis through the pad's origin moves a point at r by s^2 (r.r 1 - r r').
     """
-    at, values, mounts = solver.placement, solver.values, solver.mounts
-    first, row = pad * _MOUNT_COUNT, pad * _COUNT + _MOUNT
-    x, y, z = at.px - mounts[first], at.py - mounts[first + 1], at.pz - mounts[first + 2]
-    turning = mounts[first + 4]
-    even = mounts[first + 3] + turning * (x * x + y * y + z * z)
-    values[row], values[row + 4] = even - turning * x * x, even - turning * y * y
-    values[row + 8] = even - turning * z * z
-    values[row + 1] = values[row + 3] = -turning * x * y
-    values[row + 2] = values[row + 6] = -turning * x * z
-    values[row + 5] = values[row + 7] = -turning * y * z
+    at, turning = solver.placement, solver.mounts[pad].rotation_variance_rad2
+    x, y = at.px - solver.mounts[pad].origin_m[0], at.py - solver.mounts[pad].origin_m[1]
+    z = at.pz - solver.mounts[pad].origin_m[2]
+    even = solver.mounts[pad].position_variance_m2 + turning * (x * x + y * y + z * z)
+    xy, xz, yz = -turning * x * y, -turning * x * z, -turning * y * z
+    solver.values[pad].mount_covariance_m2[0] = even - turning * x * x
+    solver.values[pad].mount_covariance_m2[4] = even - turning * y * y
+    solver.values[pad].mount_covariance_m2[8] = even - turning * z * z
+    solver.values[pad].mount_covariance_m2[1] = solver.values[pad].mount_covariance_m2[3] = xy
+    solver.values[pad].mount_covariance_m2[2] = solver.values[pad].mount_covariance_m2[6] = xz
+    solver.values[pad].mount_covariance_m2[5] = solver.values[pad].mount_covariance_m2[7] = yz
 
 
 def _add_motion(solver: ContactSolver, factor: float) -> None:
@@ -678,11 +922,16 @@ def _add_overhang(solver: ContactSolver, pad: int) -> None:
     fit.var_y += shift_y * shift_y
 
 
-def _write_row(
-    values: memoryview[float], first: int, fit: locate.Fit, at: tables.Placement, t: float, w: float
-) -> None:
-    """Write a row of the covariance in the link's frame, from components of the tangents."""
-    by_t, by_w = fit.var_x * t + fit.cov_xy * w, fit.cov_xy * t + fit.var_y * w
-    values[first] = by_t * at.tx + by_w * at.wx
-    values[first + 1] = by_t * at.ty + by_w * at.wy
-    values[first + 2] = by_t * at.tz + by_w * at.wz
+def _find_covariance(solver: ContactSolver) -> None:
+    """Compute the covariance in the link's frame (3, 3), from that along the tangents."""
+    fit, at = solver.fit, solver.placement
+    _find_row(solver, 0, fit.var_x * at.tx + fit.cov_xy * at.wx, fit.cov_xy * at.tx + fit.var_y * at.wx)
+    _find_row(solver, 3, fit.var_x * at.ty + fit.cov_xy * at.wy, fit.cov_xy * at.ty + fit.var_y * at.wy)
+    _find_row(solver, 6, fit.var_x * at.tz + fit.cov_xy * at.wz, fit.cov_xy * at.tz + fit.var_y * at.wz)
+
+
+def _find_row(solver: ContactSolver, first: int, by_t: float, by_w: float) -> None:
+    at = solver.placement
+    solver.covariance[first] = by_t * at.tx + by_w * at.wx
+    solver.covariance[first + 1] = by_t * at.ty + by_w * at.wy
+    solver.covariance[first + 2] = by_t * at.tz + by_w * at.wz

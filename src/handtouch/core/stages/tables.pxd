@@ -14,11 +14,11 @@ cdef void read_values(float[::1] table, Py_ssize_t cells, Py_ssize_t columns, do
 cdef class PadSurface:
     cdef double[::1] values, ends
     cdef Py_ssize_t cells, patch_floats, patches
-    cdef double side_x
+    cdef double side_x, curvature
 
 cdef class Placement:
     cdef double[::1] raw
-    cdef double u_m, v_m, px, py, pz, nx, ny, nz, tx, ty, tz, wx, wy, wz, along_m, around_m, scale_m
+    cdef double u_m, v_m, px, py, pz, nx, ny, nz, tx, ty, tz, wx, wy, wz, along_m, around_m, scale_m, slope_x, slope_y
 
 @cython.locals(cells=Py_ssize_t, patch=Py_ssize_t, raw='double[::1]')
 cdef void place_contact(PadSurface surface, Placement placement, double x, double y) noexcept

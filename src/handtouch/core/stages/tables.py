@@ -17,7 +17,7 @@ from handtouch.core.memory import view_memory
 if TYPE_CHECKING:
     from handtouch.core.pad_tables import SurfacePatches
 
-_COLUMNS = 5  # of a surface
+_COLUMNS = 6  # of a surface
 
 
 def read_table(
@@ -112,18 +112,20 @@ class PadSurface:
     """Surface of one pad in its link's frame, in smooth patches that meet at folds across y.
 
     values: one table a patch, as `read_table` needs them, of `patch_floats` floats each; columns are position
-    (3) [m] and arc lengths from the electrodes x0 and y0 (2) [m], on an even grid. ends: (patches,), where
-    each patch ends along y. side_x: of the pad's rectangle.
+    (3) [m], arc lengths from the electrodes x0 and y0 (2) [m] and ln of a contact's scale, on an even grid.
+    ends: (patches,), where each patch ends along y. side_x: of the pad's rectangle. curvature: Gauss's
+    [1/m^2].
     """
 
     def __init__(self, surface: SurfacePatches) -> None:
         self.values, self.ends = view_memory(surface.nodes), view_memory(surface.ends)
         self.cells, self.patch_floats = surface.nodes.shape[1] - 1, surface.nodes[0].size
         self.patches, self.side_x = len(surface.ends), surface.side_x
+        self.curvature = surface.curvature_per_m2
 
 
 class Placement:
-    """A contact in its link's frame. `raw` (15,): what was read from the table."""
+    """A contact in its link's frame. `raw` (18,): what was read from the table."""
 
     def __init__(self) -> None:
         self.raw = view_memory(np.zeros(3 * _COLUMNS))
@@ -133,7 +135,8 @@ class Placement:
         self.tx = self.ty = self.tz = 0.0  # tangents along x and y, metres per unit of the rectangle
         self.wx = self.wy = self.wz = 0.0
         self.along_m = self.around_m = 1.0  # their lengths
-        self.scale_m = 1.0  # a contact's radius on the surface over that on the rectangle
+        self.scale_m = 1.0  # a contact's radius on the surface over that on the rectangle,
+        self.slope_x = self.slope_y = 0.0  # and the derivatives of its logarithm
 
 
 def place_contact(surface: PadSurface, placement: Placement, x: float, y: float) -> None:
@@ -149,8 +152,9 @@ def place_contact(surface: PadSurface, placement: Placement, x: float, y: float)
     read_table(surface.values, patch * surface.patch_floats, cells, _COLUMNS, s, t, raw)
     placement.px, placement.py, placement.pz = raw[0], raw[1], raw[2]
     placement.u_m, placement.v_m = raw[3], raw[4]
-    tx, ty, tz = raw[5] * per_x, raw[6] * per_x, raw[7] * per_x
-    wx, wy, wz = raw[10] * per_y, raw[11] * per_y, raw[12] * per_y
+    tx, ty, tz = raw[6] * per_x, raw[7] * per_x, raw[8] * per_x
+    wx, wy, wz = raw[12] * per_y, raw[13] * per_y, raw[14] * per_y
+    placement.slope_x, placement.slope_y = raw[11] * per_x, raw[17] * per_y
     nx, ny, nz = ty * wz - tz * wy, tz * wx - tx * wz, tx * wy - ty * wx
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     placement.nx, placement.ny, placement.nz = nx / length, ny / length, nz / length

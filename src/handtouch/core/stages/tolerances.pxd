@@ -11,7 +11,7 @@ cdef class PadTolerances:
     cdef double cell_ratio, aspect_std, wave_std, tilt_std, moment_std, middle_u_m, size_x, size_y
     cdef double[::1] elongations, overhangs
     cdef double overhang_step_m
-    cdef Py_ssize_t states
+    cdef readonly Py_ssize_t states
     cdef Py_ssize_t[::1] state_of
     cdef double state_std, state_std_per_a
     cdef bint has_series, is_elongated, is_shape_exact
@@ -33,7 +33,12 @@ cdef void whiten_by_gains(
 cdef void whiten(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
     double[::1] fractions, double[::1] weight, double total, double s, double t) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, columns=Py_ssize_t)
+@cython.locals(ratio=double, columns=Py_ssize_t)
+cdef void read_second_derivatives(Whitening whitening, PadTolerances pad, double s, double t) noexcept
+@cython.locals(first=Py_ssize_t, second=double)
+cdef double second_derivative(
+    Whitening whitening, PadTolerances pad, Py_ssize_t i, double by_xx, double by_xy) noexcept
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void whiten_elongated(
     Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
     double[::1] fractions, double[::1] weight, double total, double s, double t, double moment_std,
@@ -73,9 +78,9 @@ cdef void transpose_whitening(
 cdef void _add_changes(
     Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
     double total, double s, double t) noexcept
-@cython.locals(cell=Py_ssize_t)
-cdef void _add_elongation(
-    Whitening whitening, PadTolerances pad, double[::1] weight, double total, double s) noexcept
+@cython.locals(cell=Py_ssize_t, beyond=double, std=double)
+cdef double elongation_std(PadTolerances pad, double s) noexcept
+cdef Py_ssize_t field_count(PadTolerances pad, Py_ssize_t n) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
 cdef void _add_second_derivatives(
     Whitening whitening, Py_ssize_t states, double[::1] weight, double total, double std) noexcept

@@ -20,19 +20,21 @@ from handtouch.config.channels import channel_states
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages import tables
+from handtouch.field.channel_map import ChannelMap
+from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand.pads import (
     log_aspect_std,
-    metres_per_unit,
     pad_surface,
     relative_size_stds,
     series_ohm_stds,
+    shape_stds,
 )
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from handtouch import config
-    from handtouch.field.network import ElectrodeNetwork
+    from handtouch.field.model import ChannelModel
     from handtouch.field.surface import Surface
 
     FloatArray = NDArray[np.float64]
@@ -72,17 +74,17 @@ class PadTolerances:
         pad: config.Pad,
         node: config.Node,
         sheet: config.Sheet,
-        network: ElectrodeNetwork,
+        network: ChannelModel,
         table: ForwardTable,
     ) -> None:
         """Take the tolerances that a deployment states; `network` and `table` are the pad's."""
         surface = pad_surface(pad)
         self.values = view_memory(table.tolerance_nodes)
         self.cells, self.cell_ratio = len(table.tolerance_nodes) - 1, 1 / CELLS_PER_TOLERANCE_CELL
-        end_stds = sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network)
+        end_stds, self.wave_std = shape_stds(pad, sheet, network)
         end_vectors = np.ascontiguousarray(end_stds[:, None] * table.end_vectors)
         self.end_vectors = view_memory(end_vectors)
-        self.aspect_std, self.wave_std = log_aspect_std(pad, sheet), sheet.unevenness_std
+        self.aspect_std = log_aspect_std(pad, sheet)
         series_ohm = np.array(pad.series_ohm)
         series_stds = np.maximum(series_ohm_stds(pad, node), _MIN_SERIES_STD * series_ohm)
         series_vectors = np.ascontiguousarray(series_stds[:, None] * table.series_vectors)
@@ -92,7 +94,7 @@ class PadTolerances:
         )
         self.middle_u_m = surface.extent_m[0] / 2
         self.size_x, self.size_y = relative_size_stds(pad, sheet)
-        elongations = _elongations(sheet, surface, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
+        elongations = _elongations(sheet, surface, network, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
         self.elongations, self.is_elongated = view_memory(elongations), bool(elongations.any())
         radius_m = math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm) * _M_PER_MM
         self.overhangs = view_memory(radius_m * overhangs(sheet.contact_elongation_std))
@@ -149,10 +151,10 @@ class Whitening:
         self.vectors = view_memory(np.zeros(n * (n + parts)))
 
 
-def _state_ohm_std(network: ElectrodeNetwork) -> float:
+def _state_ohm_std(network: ChannelModel) -> float:
     """Return the root mean square, over the pad, of what a contact's resistance to ground differs by between
     the states of its schedule [ohm]; 0 without one."""
-    if not network.states:
+    if not (isinstance(network, ElectrodeNetwork) and network.states):
         return 0.0
     x, y = np.meshgrid(network.a * _STATE_GRID, network.b * _STATE_GRID)
     return math.sqrt(network.state_resistance(x, y).var(axis=0).mean())
@@ -186,20 +188,24 @@ def overhangs(elongation_std: float) -> FloatArray:
     return np.asarray(np.sqrt(square / np.maximum(weight, 1e-300)))
 
 
-def shape_error(pad: config.Pad, sheet: config.Sheet, table: ForwardTable) -> float:
+def shape_error(pad: config.Pad, sheet: config.Sheet, network: ChannelModel, table: ForwardTable) -> float:
     """Return a typical standard deviation of a fraction by contacts that are elongated as stated."""
     x, y = (nodes[::CELLS_PER_TOLERANCE_CELL, 0] for nodes in (table.nodes_x, table.nodes_y))
     second = table.tolerance_nodes[:, :, 0, -2 * table.electrodes :].astype(np.float64)
-    square = (second**2).sum(axis=2) / table.electrodes * _elongations(sheet, pad_surface(pad), x) ** 2
+    square = (
+        (second**2).sum(axis=2) / table.electrodes * _elongations(sheet, pad_surface(pad), network, x) ** 2
+    )
     inside = [(at > _MARGIN * at.max()) & (at < (1 - _MARGIN) * at.max()) for at in (y, x)]
     return float(np.sqrt(np.median(square[np.ix_(*inside)])))
 
 
-def _elongations(sheet: config.Sheet, surface: Surface, x: FloatArray) -> FloatArray:
+def _elongations(sheet: config.Sheet, surface: Surface, network: ChannelModel, x: FloatArray) -> FloatArray:
     """Return half the standard deviation of the difference of variances of a contact's current, at x (k,).
 
     Along the rectangle's axes, in squares of its unit, of elliptical patches of pressure in all directions.
     """
+    if isinstance(network, ChannelMap):
+        return np.ascontiguousarray(network.patch_std(x, np.full(len(x), surface.b / 2)))
     area_m2 = (sheet.contact_radius_mm**2 + sheet.contact_radius_std_mm**2) * _M_PER_MM**2
     difference_m2 = area_m2 / 4 * 2 * math.sinh(sheet.contact_elongation_std)
     inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
@@ -275,10 +281,23 @@ def whiten_elongated(
         whitening.matrix[i * n + i] += error * error
     _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
     _add_parts(whitening, pad, known, number)
-    ratio, columns = pad.cell_ratio, (2 * pad.states + 3 + _WAVES) * n
-    tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, whitening.fields)
+    read_second_derivatives(whitening, pad, s, t)
     _add_second_derivatives(whitening, pad.states, weight, total, moment_std)
     _invert_root(whitening.matrix, n)
+
+
+def read_second_derivatives(whitening: Whitening, pad: PadTolerances, s: float, t: float) -> None:
+    """Read the fields of a pad at (s, t), in cells of the forward model, for `second_derivative`."""
+    ratio, columns = pad.cell_ratio, field_count(pad, whitening.electrodes)
+    tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, whitening.fields)
+
+
+def second_derivative(whitening: Whitening, pad: PadTolerances, i: int, by_xx: float, by_xy: float) -> float:
+    """Return these multiples of the second derivatives of fraction i by x x and by x y, summed."""
+    first = (2 * pad.states + 1 + _WAVES) * whitening.electrodes
+    second: float = by_xx * whitening.fields[first + i]
+    second += by_xy * whitening.fields[first + whitening.electrodes + i]
+    return second
 
 
 def whiten_pair(
@@ -343,7 +362,9 @@ def _add_contact(
     if not pad.is_shape_exact:
         _add_changes(whitening, pad, fractions, first, weight, total, s, t)
     if pad.is_elongated:
-        _add_elongation(whitening, pad, weight, total, s * pad.cell_ratio)
+        # current that spreads with variances v + d along one direction and v - d at right angles to it adds d
+        # times the second derivative along it, as potentials are harmonic; the direction is unknown
+        _add_second_derivatives(whitening, pad.states, weight, total, elongation_std(pad, s))
 
 
 def _add_states(
@@ -431,8 +452,7 @@ def _add_changes(
     """Add the changes of the currents over noise by one standard deviation of each part."""
     n, changes, fields = whitening.electrodes, whitening.changes, whitening.fields
     ends, ratio = 2 * pad.states * n, pad.cell_ratio
-    columns = ends + (3 + _WAVES) * n
-    tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, fields)
+    tables.read_values(pad.values, pad.cells, field_count(pad, n), s * ratio, t * ratio, fields)
     for i in range(n):
         scale = total * weight[i]
         field = 2 * n * pad.state_of[i]
@@ -452,20 +472,23 @@ def _add_changes(
             changes[resistor + n * n] -= together * scale
 
 
-def _add_elongation(
-    whitening: Whitening, pad: PadTolerances, weight: memoryview[float], total: float, s: float
-) -> None:
-    """Add the covariance by patches that aren't round, at s cells; `fields` are those there.
-
-    Current that spreads with variances v + d along one direction and v - d at right angles to it adds d times
-    the second derivative along that direction, as potentials are harmonic; the direction is unknown.
-    """
+def elongation_std(pad: PadTolerances, s: float) -> float:
+    """Return the deviation of half the difference of a contact's variances along two axes at right angles, in
+    squares of the rectangle's unit, at s cells of the forward model; 0 if contacts are round."""
+    if not pad.is_elongated:
+        return 0.0
+    s *= pad.cell_ratio
     cell = int(s)
     if cell > pad.cells - 1:
         cell = pad.cells - 1
     beyond = s - cell
-    std = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
-    _add_second_derivatives(whitening, pad.states, weight, total, std)
+    std: float = (1.0 - beyond) * pad.elongations[cell] + beyond * pad.elongations[cell + 1]
+    return std
+
+
+def field_count(pad: PadTolerances, n: int) -> int:
+    """Return the number of fields of a pad of n electrodes: by ends, aspect and waves, second derivatives."""
+    return (2 * pad.states + 3 + _WAVES) * n
 
 
 def _add_second_derivatives(

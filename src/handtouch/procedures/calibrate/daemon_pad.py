@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -36,16 +36,21 @@ class ServedPad:
 
     `active_calibration`: the daemon's answer to `calibrate`. `serial`: of the node, None until known or if
     there is none. `tare_offsets`: mean counts and their variances (4,) of the last tare. `store`: that which
-    the daemon reads, None without. Raises what `client.request` does.
+    the daemon reads, None without. second_ampere_per_count: of the channel of the pad's second sheet, None
+    without one. Raises what `client.request` does.
     """
 
-    def __init__(self, endpoints: DaemonEndpoints, hand: str, link: str) -> None:
+    def __init__(
+        self, endpoints: DaemonEndpoints, hand: str, link: str, second_ampere_per_count: float | None = None
+    ) -> None:
         self.name = f"{hand}/{link}"
         self.active_calibration: dict[str, Any] = {}
         self.serial: int | None = None
         self.tare_offsets: tuple[list[float], list[float]] | None = None
         self.store: Path | None = None
         self._endpoints, self._hand, self._link = endpoints, hand, link
+        self._second_ampere_per_count = second_ampere_per_count
+        self._second_count, self._second_zero = math.nan, 0.0
         self._sync_ns = 0
         self._lease_renewed_s = -math.inf
 
@@ -57,6 +62,7 @@ class ServedPad:
         self._messages = client.connect(
             f"hand/{self._hand}",
             f"health/{self._hand}/{self._link}",
+            *([] if self._second_ampere_per_count is None else [f"raw/{self._hand}"]),
             endpoint=self._endpoints.live,
             key=self._endpoints.key,
         )
@@ -73,6 +79,10 @@ class ServedPad:
             message = self._messages.recv(_RECEIVE_TIMEOUT_S)
             if isinstance(message, wire.Health):
                 self.serial = message.serial or None
+            elif isinstance(message, wire.Raw):
+                counts = client.columns(message).get("second_counts")
+                if counts is not None and len(counts):
+                    self._second_count = float(counts[message.links.index(self._link)])
             elif isinstance(message, wire.HandFrame) and not message.retained:
                 self._sync_ns = max(message.t_ns, self._sync_ns)
                 yield self._sample_from_frame(message)
@@ -87,12 +97,16 @@ class ServedPad:
             return str(pad["reason"])
         variance = [std**2 / max(pad["samples"], 1) for std in pad["std_counts"]]
         self.tare_offsets = list(pad["offset_counts"]), variance
+        self._second_zero = pad.get("second_offset_counts") or 0.0
         return ""
 
-    def apply_law(self, calibration_id: str, law: LawParameters) -> str:
-        """Apply a law; return the identifier of the active calibration."""
-        parameters = {key: value for key, value in asdict(law).items() if key != "covariance"}
-        answer = self._request("calibrate", pad=self.name, name=calibration_id, law=parameters)
+    def apply_laws(self, calibration_id: str, laws: Sequence[LawParameters]) -> str:
+        """Apply the laws of the pad's sheets; return the identifier of the active calibration."""
+        parameters: dict[str, Any] = {
+            name: {key: value for key, value in asdict(law).items() if key != "covariance"}
+            for name, law in zip(("law", "second_law"), laws, strict=False)
+        }
+        answer = self._request("calibrate", pad=self.name, name=calibration_id, **parameters)
         return str(answer["calibration_id"])
 
     @property
@@ -107,7 +121,7 @@ class ServedPad:
                 "scene",
                 name=self._scene_name,
                 links=[self.name],
-                outputs=["position", "force"],
+                outputs=["position", "force", *([] if self._second_ampere_per_count is None else ["raw"])],
                 rate_hz=0,
                 lease_s=_SCENE_LEASE_S,
             )
@@ -124,6 +138,8 @@ class ServedPad:
             current_a=float(columns["total_current_a"][row]),
             position_m=(x, y),
             force_n=float(columns["force_n"][row]),
+            second_current_a=(self._second_count - self._second_zero)
+            * (self._second_ampere_per_count or math.nan),
         )
 
     def _request(self, command: str, timeout_s: float = 3.0, **arguments: Any) -> dict[str, Any]:

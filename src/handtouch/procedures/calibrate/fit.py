@@ -1,6 +1,7 @@
 """Fit of contact law and sheet resistance to readings of known weights, as in the paper's 4.3.
 
-Public names: `fit_law`, `LawFit`, `ConfidenceInterval`, `PARAMETERS`, `MIN_EVIDENCE`.
+Public names: `fit_law`, `fit_laws` of `SheetReadings`, `LawFit`, `ConfidenceInterval`, `PARAMETERS`,
+`MIN_EVIDENCE`.
 
 A contact of radius A under a force F passes I = V / (stack(sheet, sigma, A, R) + series), eq. 11, with
 sigma = k / (F / pi A^2)^alpha, eq. 12. The paper guesses the plane's resistance from the largest force and
@@ -102,6 +103,16 @@ class LawFit:
         return self.basis.band(force_n, circuit, radius_m)
 
 
+@dataclass(frozen=True)
+class SheetReadings:
+    """Readings of one sheet, each with its circuit; start: the deployment file's law."""
+
+    readings: Sequence[WeightReading]
+    circuits: Sequence[ContactCircuit]
+    start: LawParameters
+    reference_pa: float
+
+
 def fit_law(
     readings: Sequence[WeightReading],
     circuits: Sequence[ContactCircuit],
@@ -114,21 +125,36 @@ def fit_law(
     start: the deployment file's, where the search begins. radius_std: standard deviation of an indenter's ln
     radius. Raises ValueError for too few readings.
     """
-    if lack := _insufficient_data(readings):
-        raise ValueError(lack)
-    constant = _ReadingColumns.from_readings(readings, circuits, reference_pa, radius_std)
-    growing = replace(
-        constant, hertz_force_n=start.hertz_force_n or float(np.exp(np.log(constant.force_n).mean()))
-    )
-    evidence = _deviance(constant, start) - _deviance(growing, start)
-    is_growing = evidence > (MIN_EVIDENCE if start.hertz_force_n is None else -MIN_EVIDENCE)
-    data = growing if is_growing else constant
-    free = _solve(data, start, sheet_std=math.inf)
+    (fit,) = fit_laws([SheetReadings(readings, circuits, start, reference_pa)], radius_std)
+    return fit
+
+
+def fit_laws(sheets: Sequence[SheetReadings], radius_std: float) -> list[LawFit]:
+    """Fit the laws of sheets under the same weights: the contact's radius follows one law. Raises as
+    `fit_law`."""
+    columns, evidence, before_n = [], 0.0, sheets[0].start.hertz_force_n
+    for sheet in sheets:
+        if lack := _insufficient_data(sheet.readings):
+            raise ValueError(lack)
+        constant = _ReadingColumns.from_readings(
+            sheet.readings, sheet.circuits, sheet.reference_pa, radius_std
+        )
+        growing = replace(constant, hertz_force_n=before_n or float(np.exp(np.log(constant.force_n).mean())))
+        evidence += _deviance(constant, sheet.start) - _deviance(growing, sheet.start)
+        columns.append((constant, growing))
+    is_growing = evidence > (MIN_EVIDENCE if before_n is None else -MIN_EVIDENCE)
+    return [
+        _fit_columns(data[is_growing], sheet, evidence) for data, sheet in zip(columns, sheets, strict=True)
+    ]
+
+
+def _fit_columns(data: _ReadingColumns, sheet: SheetReadings, evidence: float) -> LawFit:
+    free = _solve(data, sheet.start, sheet_std=math.inf)
     observed = free is not None and free.sheet_std < _MAX_OBSERVED_LOG_STD
-    solved = free if observed and free is not None else _solve(data, start, sheet_std=SHEET_LOG_STD)
+    solved = free if observed and free is not None else _solve(data, sheet.start, sheet_std=SHEET_LOG_STD)
     if solved is None:
-        raise ValueError(f"no law fits these readings: {_failure_causes(readings)}")
-    return _build_fit(solved, observed, readings, evidence)
+        raise ValueError(f"no law fits these readings: {_failure_causes(sheet.readings)}")
+    return _build_fit(solved, observed, sheet.readings, evidence)
 
 
 def _deviance(data: _ReadingColumns, start: LawParameters) -> float:
@@ -147,6 +173,8 @@ class _ReadingColumns:
     log_current: FloatArray
     variance: FloatArray
     """of log_current, from noise"""
+    log_force_std: FloatArray
+    """of ln force, as stated"""
     spreading_m: FloatArray
     spreading_log_std: FloatArray
     drive_v: FloatArray
@@ -170,9 +198,10 @@ class _ReadingColumns:
         current = np.array([reading.current_a for reading in readings])
         noise = np.array([reading.current_std_a for reading in readings]) / current
         return cls(
-            np.array([reading.weight.force_n for reading in readings]),
+            np.array([reading.apparent_n for reading in readings]),
             np.log(current),
             noise**2,
+            np.array([reading.weight.std_n / reading.weight.force_n for reading in readings]),
             np.array([circuit.spreading_m for circuit in circuits]),
             np.array([circuit.spreading_log_std for circuit in circuits]),
             np.array([circuit.drive_v for circuit in circuits]),
@@ -262,7 +291,7 @@ def _solve(data: _ReadingColumns, start: LawParameters, sheet_std: float) -> _La
         jacobian = (values[1:] - values[0]).T / _DIFFERENCE_STEP
         residual = data.log_current - values[0]
         by_load, by_place = data.slopes(theta)
-        known = data.variance + by_place**2
+        known = data.variance + by_place**2 + (by_load * data.log_force_std) ** 2
         scatter = _scatter(residual, known, by_load**2, freedom)
         variance = known + (scatter * by_load) ** 2
         normal = (jacobian.T / variance) @ jacobian + precision
@@ -341,7 +370,7 @@ class _BandBasis:
         indenter = int(np.argmin(np.abs(self.data.radii_m - radius_m)))
         like = np.ones_like(force_n)
         at = replace(
-            self.data, force_n=force_n, log_current=like, variance=like,
+            self.data, force_n=force_n, log_current=like, variance=like, log_force_std=0 * like,
             spreading_m=circuit.spreading_m * like, spreading_log_std=0 * like,
             drive_v=circuit.drive_v * like, series_ohm=circuit.series_ohm * like,
             indenter=np.full(len(force_n), indenter, dtype=np.intp),
@@ -374,7 +403,7 @@ def _insufficient_data(readings: Sequence[WeightReading]) -> str:
 def _failure_causes(readings: Sequence[WeightReading]) -> str:
     """Return likely causes why no law fits."""
     causes = _decreasing_currents(readings)
-    force, current = np.log([(reading.weight.force_n, reading.current_a) for reading in readings]).T
+    force, current = np.log([(reading.apparent_n, reading.current_a) for reading in readings]).T
     if not causes and abs(np.polyfit(force, current, 1)[0]) < _MIN_CURRENT_SLOPE:
         causes = ["the current hardly changes with the weight, the sheet limits it: add lighter weights"]
     return "; ".join(causes) or "were weights mixed up, or was another pad under them?"
@@ -411,7 +440,7 @@ def _problems(
                 "place, let the sheet recover, repeat each more often"
             )
         found.append(f"{text}; {'; '.join(causes) or 'repeat each weight more often'}")
-    if not wide and (chance := _lack_of_fit_probability(solved, residual)) < _MIN_LAW_PROBABILITY:
+    if not wide and (chance := _lack_of_fit_probability(solved, readings, residual)) < _MIN_LAW_PROBABILITY:
         found.append(
             f"the readings don't lie on such a law (chance {chance:.1g}): does the contact's size change "
             "with the weight, otherwise than under a round object? Stand all weights on one foot, flat or "
@@ -420,11 +449,13 @@ def _problems(
     return found
 
 
-def _lack_of_fit_probability(solved: _LawSolution, residual: FloatArray) -> float:
+def _lack_of_fit_probability(
+    solved: _LawSolution, readings: Sequence[WeightReading], residual: FloatArray
+) -> float:
     """Return the probability of means so far from the law, by the scatter of repetitions; 1 without any."""
-    data = solved.data
     scaled = residual / np.sqrt(solved.variance)
-    _, group = np.unique(np.stack([data.force_n, data.radii_m[data.indenter]]), axis=1, return_inverse=True)
+    weights = [(reading.weight.force_n, reading.weight.radius_m) for reading in readings]
+    _, group = np.unique(weights, axis=0, return_inverse=True)
     group = group.reshape(-1)
     count = np.bincount(group)
     mean = np.bincount(group, scaled) / count

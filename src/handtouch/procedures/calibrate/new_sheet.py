@@ -10,11 +10,10 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-import handtouch
 from handtouch import config
 from handtouch.calibration.calibration import NEW_SHEET_METHOD, Calibration, Provenance
 from handtouch.calibration.store import Store, StoreError
-from handtouch.host.user import user_name
+from handtouch.host.user import program_name
 
 
 def store_new_sheet(
@@ -28,7 +27,7 @@ def store_new_sheet(
     with Store(path) as store:
         newest = store.newest(serial, default_calibration_id)
         known = newest.calibration if newest is not None else Calibration()
-        if newest is not None and (newest.config != default_calibration_id or newest.provenance.foreign):
+        if newest is not None and not newest.is_own(default_calibration_id):
             raise StoreError(
                 f"{pad.name}: version {newest.number} of node {serial} is of another node or other tables, "
                 "so its gains can't be kept; calibrate the pad"
@@ -39,7 +38,7 @@ def store_new_sheet(
             hand=pad.hand,
             link=pad.pad.link,
             host=platform.node(),
-            program=f"{user_name()}, handtouch {handtouch.__version__}",
+            program=program_name(),
             note=f"after version {newest.number}" if newest is not None else "",
         )
         made = Calibration(gains)

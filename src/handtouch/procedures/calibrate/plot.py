@@ -30,7 +30,7 @@ _DPI = 150
 def sketch(fit: LawFit, readings: Sequence[WeightReading], circuits: Sequence[ContactCircuit]) -> str:
     """Return a sketch: o for a reading, dots for the band, dashes for the law of the first indenter."""
     radius = readings[0].weight.radius_m
-    force = np.array([reading.weight.force_n for reading in readings])
+    force = np.array([reading.apparent_n for reading in readings])
     current = np.log([reading.current_a for reading in readings])
     grid = np.geomspace(force.min() / _FORCE_MARGIN, force.max() * _FORCE_MARGIN, _WIDTH)
     law, half = fit.band(grid, _median_circuit(circuits), radius)
@@ -107,7 +107,7 @@ def _plot_current(
     mark: str,
     label: str,
 ) -> None:
-    force = np.array([reading.weight.force_n for reading in readings])
+    force = np.array([reading.apparent_n for reading in readings])
     grid = np.geomspace(force.min() / _FORCE_MARGIN, force.max() * _FORCE_MARGIN, 200)
     law, half = fit.band(grid, _median_circuit(circuits), readings[0].weight.radius_m)
     axes.fill_between(grid, 1e3 * np.exp(law - half), 1e3 * np.exp(law + half), color=_BAND, alpha=0.2, lw=0)
@@ -126,7 +126,7 @@ def _plot_contact_resistance(
 ) -> None:
     """Plot V / I less the plane's part, a line of slope -alpha (if A is constant)."""
     stated_m, circuit = readings[0].weight.radius_m, _median_circuit(circuits)
-    force = np.array([reading.weight.force_n for reading in readings])
+    force = np.array([reading.apparent_n for reading in readings])
     radii = fit.radius_m(force, stated_m)
     plane = np.array([_sheet_resistance(fit, *one) for one in zip(circuits, radii, strict=True)])
     drive = np.array([one.drive_v for one in circuits])

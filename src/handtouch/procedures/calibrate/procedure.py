@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,8 @@ _SETTLING_TIMEOUT_NS = 15 * _SECOND_NS
 @dataclass(frozen=True)
 class PadSample:
     """Sample of a pad. alive: the pad delivers samples; total current [A]; if touched, contact position as
-    arc lengths [m] and the daemon's force [N], NaN without one."""
+    arc lengths [m] and the daemon's force [N], NaN without one; current of a second sheet [A], NaN without
+    one."""
 
     sync_ns: int
     alive: bool
@@ -45,6 +46,21 @@ class PadSample:
     current_a: float = 0.0
     position_m: tuple[float, float] = (math.nan, math.nan)
     force_n: float = math.nan
+    second_current_a: float = math.nan
+
+
+class SettledMeans(NamedTuple):
+    """Means of a settled load as `WeightReading` has them."""
+
+    current_a: float
+    current_std_a: float
+    samples: int
+    position_m: tuple[float, float]
+    reported_force_n: float
+    second_current_a: float
+    second_std_a: float
+    loaded_s: float
+    measured_s: float
 
 
 class SampledPad(Protocol):
@@ -132,13 +148,14 @@ class WeightProcedure(GuidedProcedure[PadSample]):
                 return False
 
     def _measure_with_retries(self, title: str, weight: Weight) -> WeightReading:
-        rejection = ""
+        rejection, unloaded_s = "", math.nan
         for _ in range(_MAX_ATTEMPTS):
-            self._await_unloaded()
+            later_s = self._await_unloaded()
+            unloaded_s = later_s if math.isnan(unloaded_s) else unloaded_s
             self.print_line(f"{title} place {weight.name} on the middle of {self._name}", "ask")
             reading, rejection = self._await_reading(weight)
             if not rejection:
-                return reading
+                return replace(reading, unloaded_s=unloaded_s)
             self.print_line(f"  {rejection}; remove it and place it again.", "bad")
         raise _NoReading(rejection)
 
@@ -150,22 +167,26 @@ class WeightProcedure(GuidedProcedure[PadSample]):
             settled = settling.add_sample(sample)
             self._show_progress(sample, settling)
             if settled is not None:
-                reading = WeightReading(weight, *settled)
-                return reading, self._circuit_model.rejection_reason(reading.position_m, reading.current_a)
-            since = settling.loaded_ns
-            if since is not None and sample.sync_ns - since > _SETTLING_TIMEOUT_NS:
+                reading = WeightReading(weight, **settled._asdict())
+                return reading, self._circuit_model.rejection_reason(reading)
+            since, has_mean = settling.loaded_ns, math.isfinite(settling.relative_drift)
+            if since is not None and has_mean and sample.sync_ns - since > _SETTLING_TIMEOUT_NS:
                 drift = f"{settling.relative_drift:.1%} a second"
                 raise _NoReading(f"the reading doesn't settle ({drift}): is the weight stable?")
-            if since is None and waited_ns > self._timeout_ns:
-                raise _NoReading(
-                    f"{self._name} delivers no samples: is its node connected? See `handtouch status`"
-                    if not sample.alive
-                    else "no contact: is the weight on this pad, and heavier than its begin_threshold_n?"
-                )
+            if not has_mean and waited_ns > self._timeout_ns:
+                raise _NoReading(self._reason_without_mean(sample))
         raise _NoReading("the samples ended")
 
-    def _await_unloaded(self) -> None:
-        """Wait until the pad is unloaded. Raises _NoReading, DialogueCancelled."""
+    def _reason_without_mean(self, sample: PadSample) -> str:
+        """Return why there is no mean of a load in time, by the last sample."""
+        if not sample.alive:
+            return f"{self._name} delivers no samples: is its node connected? See `handtouch status`"
+        if sample.touched:
+            return f"{self._name} delivers too few samples for a mean: is the computer overloaded?"
+        return "no contact: is the weight on this pad, and heavier than its begin_threshold_n?"
+
+    def _await_unloaded(self) -> float:
+        """Wait until the pad is unloaded; return since when [s]. Raises _NoReading, DialogueCancelled."""
         unloaded_ns: int | None = None
         for sample, waited_ns in self.timed_samples():
             self.raise_on_key()
@@ -174,10 +195,11 @@ class WeightProcedure(GuidedProcedure[PadSample]):
             elif unloaded_ns is None:
                 unloaded_ns = sample.sync_ns
             elif sample.sync_ns - unloaded_ns >= _MIN_UNLOADED_NS:
-                return
+                return 1e-9 * unloaded_ns
             if waited_ns > self._timeout_ns:
                 reason = "is still loaded" if sample.alive else "delivers no samples: see `handtouch status`"
                 raise _NoReading(f"{self._name} {reason}")
+        raise _NoReading("the samples ended")
 
     def _report_reading(self, reading: WeightReading) -> None:
         same = [other.current_a for other in self.readings if other.weight == reading.weight]
@@ -211,8 +233,8 @@ class SettlingDetector:
         self.relative_drift = math.nan
         self._samples: deque[PadSample] = deque()
 
-    def add_sample(self, sample: PadSample) -> tuple[float, float, int, tuple[float, float], float] | None:
-        """Add a sample; once settled, return mean current, its std [A], samples, position [m], force [N]."""
+    def add_sample(self, sample: PadSample) -> SettledMeans | None:
+        """Add a sample; once settled, return the means."""
         if not sample.alive:
             return None
         if not sample.touched:
@@ -224,22 +246,24 @@ class SettlingDetector:
         if sample.sync_ns - self.loaded_ns < _CREEP_DELAY_NS:
             return None
         self._samples.append(sample)
-        while sample.sync_ns - self._samples[0].sync_ns > _MEAN_DURATION_NS:
-            self._samples.popleft()
-        if (
-            sample.sync_ns - self.loaded_ns < _CREEP_DELAY_NS + _MEAN_DURATION_NS
-            or len(self._samples) < _MIN_SAMPLES
+        # where samples are few, as while the computer is busy, the mean is of more time
+        while (
+            len(self._samples) > _MIN_SAMPLES
+            and sample.sync_ns - self._samples[0].sync_ns > _MEAN_DURATION_NS
         ):
+            self._samples.popleft()
+        is_whole = sample.sync_ns - self.loaded_ns >= _CREEP_DELAY_NS + _MEAN_DURATION_NS
+        if not is_whole or len(self._samples) < _MIN_SAMPLES:
             return None
-        return self._mean_if_settled()
+        return self._mean_if_settled(1e-9 * self.loaded_ns)
 
-    def _mean_if_settled(self) -> tuple[float, float, int, tuple[float, float], float] | None:
-        current = np.array([sample.current_a for sample in self._samples])
-        mean = float(current.mean())
-        batches = np.array([part.mean() for part in np.array_split(current, _BATCH_COUNT)])
-        trend, standard_error = _trend(batches)
-        self.relative_drift = trend / mean
-        if abs(trend) > max(_MAX_SETTLED_DRIFT * abs(mean), _MAX_SETTLED_DRIFT_SIGMA * standard_error):
+    def _mean_if_settled(self, loaded_s: float) -> SettledMeans | None:
+        means = [
+            _mean_of_settled(np.array([getattr(sample, name) for sample in self._samples]))
+            for name in ("current_a", "second_current_a")
+        ]
+        self.relative_drift = means[0][2]
+        if not all(is_settled for *_, is_settled in means):
             return None
         positions = np.array([sample.position_m for sample in self._samples])
         if not np.isfinite(positions).all(axis=1).any():
@@ -247,8 +271,20 @@ class SettlingDetector:
         x, y = np.nanmedian(positions, axis=0).tolist()
         forces = np.array([sample.force_n for sample in self._samples])
         force = float(np.nanmean(forces)) if np.isfinite(forces).any() else math.nan
-        noise = float(batches.std(ddof=1)) / math.sqrt(_BATCH_COUNT)
-        return mean, noise, len(current), (x, y), force
+        measured_s = 1e-9 * float(np.mean([sample.sync_ns for sample in self._samples]))
+        settled = *means[0][:2], len(self._samples), (x, y), force, *means[1][:2]
+        return SettledMeans(*settled, loaded_s, measured_s)
+
+
+def _mean_of_settled(current: NDArray[np.float64]) -> tuple[float, float, float, bool]:
+    """Return mean of currents, its standard deviation, relative drift, and True if that is no creep, or if
+    there are none."""
+    mean = float(current.mean())
+    batches = np.array([part.mean() for part in np.array_split(current, _BATCH_COUNT)])
+    trend, standard_error = _trend(batches)
+    is_creep = abs(trend) > max(_MAX_SETTLED_DRIFT * abs(mean), _MAX_SETTLED_DRIFT_SIGMA * standard_error)
+    noise = float(batches.std(ddof=1)) / math.sqrt(_BATCH_COUNT)
+    return mean, noise, trend / mean if mean else 0.0, not is_creep
 
 
 def _trend(values: NDArray[np.float64]) -> tuple[float, float]:

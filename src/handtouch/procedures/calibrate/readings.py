@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from handtouch import config
+from handtouch.config.roles import SECOND_SHEET, channel_numbers
+from handtouch.core.pad_model import channel_ampere_per_count
 from handtouch.field import Surface
-from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import pad_network, pad_surface
+from handtouch.field.model import ChannelModel
+from handtouch.hand import pad_channels, pad_surface
 from handtouch.host.units import GRAM_FORCE_N
 
 _MAX_CENTRE_OFFSET_FRACTION = 0.3
@@ -25,11 +27,12 @@ _MAX_RANGE_FRACTION = 0.98  # fraction of a channel's range
 
 @dataclass(frozen=True)
 class Weight:
-    """Known load: force [N], radius of its foot [m], and name, as "50 gf"."""
+    """Known load: force [N], radius of its foot [m], and name, as "50 gf"; std_n: of the force."""
 
     force_n: float
     radius_m: float
     name: str
+    std_n: float = 0.0
 
 
 def parse_weights(text: str, unit: str, radius_mm: float) -> list[Weight]:
@@ -66,7 +69,10 @@ class WeightReading:
     """Reading of one weight: mean total current [A] once settled, and standard deviation of the mean.
 
     position_m: arc lengths on the pad from electrodes x0 and y0. reported_force_n: force that the daemon
-    published, NaN without one.
+    published, NaN without one. second_current_a, second_std_a: the same of the pad's second sheet, NaN
+    without one. unloaded_s, loaded_s, measured_s: times of one clock at which the pad was unloaded before,
+    at which the weight came, and of the mean's middle, NaN where unknown. response: reading over load by the
+    sheet's behaviour.
     """
 
     weight: Weight
@@ -75,6 +81,22 @@ class WeightReading:
     samples: int
     position_m: tuple[float, float]
     reported_force_n: float = math.nan
+    second_current_a: float = math.nan
+    second_std_a: float = math.nan
+    unloaded_s: float = math.nan
+    loaded_s: float = math.nan
+    measured_s: float = math.nan
+    response: float = 1.0
+
+    @property
+    def apparent_n(self) -> float:
+        """Return the force that the sheet's reading stands for: the core compensates it to the weight's."""
+        return self.weight.force_n * self.response
+
+    @property
+    def of_second(self) -> WeightReading:
+        """Return the reading of the second sheet as one of the first."""
+        return replace(self, current_a=self.second_current_a, current_std_a=self.second_std_a)
 
 
 @dataclass(frozen=True)
@@ -88,13 +110,21 @@ class ContactCircuit:
 
 
 class PadCircuitModel:
-    """Circuit at positions of one pad, by the deployment file."""
+    """Circuit at positions of one pad, by the deployment file.
+
+    second_sheet: with the current per count of its channel, None without one.
+    """
 
     def __init__(self, deployment: config.Deployment, pad: config.Pad) -> None:
         self.pad = pad
-        self.node, self.sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
+        self.node, self.sheet = deployment.nodes[pad.node], deployment.sheet_of(pad)
         self._surface: Surface = pad_surface(pad)
-        self._network: ElectrodeNetwork = pad_network(pad, self.sheet)
+        self._network: ChannelModel = pad_channels(pad, self.sheet, self.node)
+        self.second_sheet = deployment.sheets[pad.second_sheet] if pad.second_sheet else None
+        self.second_ampere_per_count: float | None = None
+        if self.second_sheet is not None:
+            (number,) = channel_numbers(pad, SECOND_SHEET)
+            self.second_ampere_per_count = channel_ampere_per_count(self.node, number)
 
     def circuit_at(self, position_m: tuple[float, float], std_m: float = 0.0) -> ContactCircuit:
         """Return the circuit at arc lengths (x, y) from x0 and y0; std_m: standard deviation of the
@@ -108,14 +138,15 @@ class PadCircuitModel:
         moved = [float(np.log(self._network.spreading_radius(u, v) * s / radius)) for u, v, s in shifted]
         return ContactCircuit(self.node.drive_v, float(radius), math.hypot(*moved), float(series))
 
-    def rejection_reason(self, position_m: tuple[float, float], current_a: float) -> str:
-        """Return why a reading there can't be used; empty if it can."""
-        x, y, _ = self._to_rectangle(position_m)
+    def rejection_reason(self, reading: WeightReading) -> str:
+        """Return why a reading can't be used; empty if it can."""
+        x, y, _ = self._to_rectangle(reading.position_m)
         aside = max(abs(x / self._surface.a - 0.5), abs(y / self._surface.b - 0.5))
         if not aside < _MAX_CENTRE_OFFSET_FRACTION:
             return "the weight is far from the middle of the pad"
         shares = self._network.fractions(x, y)
-        if float(np.max(shares)) * current_a > _MAX_RANGE_FRACTION * self.node.full_scale_ma * 1e-3:
+        greatest = max(float(np.max(shares)) * reading.current_a, reading.second_current_a)
+        if greatest > _MAX_RANGE_FRACTION * self.node.full_scale_ma * 1e-3:
             return "a channel is at the end of its range: leave this weight out, or lower drive_v"
         return ""
 

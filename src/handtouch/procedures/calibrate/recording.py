@@ -15,6 +15,14 @@ from typing import Any, Self
 from handtouch.procedures.calibrate.readings import Weight, WeightReading
 
 _FORMAT = "handtouch-calibration-session"
+_OPTIONAL = (
+    "reported_force_n",
+    "second_current_a",
+    "second_std_a",
+    "unloaded_s",
+    "loaded_s",
+    "measured_s",
+)  # null where unknown
 
 
 @dataclass(frozen=True)
@@ -42,9 +50,10 @@ class ReadingRecorder:
     def write_reading(self, reading: WeightReading) -> None:
         """Write a reading."""
         record = asdict(reading)
-        record["reported_force_n"] = (
-            None if math.isnan(reading.reported_force_n) else reading.reported_force_n
-        )
+        del record["response"]  # follows from the times and the deployment file
+        for name in _OPTIONAL:
+            if math.isnan(record[name]):
+                record[name] = None
         self._write_line(record)
 
     def _write_line(self, record: dict[str, Any]) -> None:
@@ -82,11 +91,13 @@ def read_recording(path: Path) -> tuple[RecordingHeader, list[WeightReading]]:
 def _parse_reading(record: dict[str, Any]) -> WeightReading:
     weight = Weight(**record.pop("weight"))
     x, y = (float(value) for value in record.pop("position_m"))
-    reported = record.pop("reported_force_n")
+    optional: dict[str, Any] = {
+        name: math.nan if (value := record.pop(name, None)) is None else float(value) for name in _OPTIONAL
+    }
     made = WeightReading(
         weight=weight,
         position_m=(x, y),
-        reported_force_n=math.nan if reported is None else float(reported),
+        **optional,
         **record,
     )
     numbers = (weight.force_n, weight.radius_m, made.current_a, made.current_std_a, x, y)

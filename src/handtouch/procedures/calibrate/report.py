@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from handtouch import config
 from handtouch.calibration.calibration import LawParameters
-from handtouch.core.pad_model import contact_law
+from handtouch.core.pad_model import contact_law, law_of
 from handtouch.procedures.calibrate.fit import MIN_EVIDENCE, PARAMETERS, LawFit
-from handtouch.procedures.calibrate.readings import ContactCircuit, PadCircuitModel, WeightReading
+from handtouch.procedures.calibrate.readings import ContactCircuit, WeightReading
 
 _UNITS = {"contact_ohm_mm2": "ohm mm2", "alpha": "", "ohm_per_square": "ohm per square"}
 
@@ -36,7 +37,8 @@ class WeightErrors:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """Fit with the force errors of the daemon before, and expected after it."""
+    """Fit with the force errors of the daemon before, and expected after it; second: of the pad's second
+    sheet."""
 
     pad: str
     fit: LawFit
@@ -44,23 +46,34 @@ class CalibrationReport:
     force_error_before: float
     force_error_after: float
     default_law: LawParameters
+    second: CalibrationReport | None = None
+
+    @property
+    def laws(self) -> list[LawParameters]:
+        """Laws of the pad's sheets."""
+        return [self.fit.law, *([] if self.second is None else [self.second.fit.law])]
+
+    @property
+    def problems(self) -> list[str]:
+        """Reasons not to use the laws, with remedies."""
+        named = [] if self.second is None else [f"second sheet: {one}" for one in self.second.problems]
+        return [*self.fit.problems, *named]
 
 
 def build_report(
     pad: str,
     fit: LawFit,
-    circuit_model: PadCircuitModel,
+    sheet: config.Sheet,
     readings: Sequence[WeightReading],
     circuits: Sequence[ContactCircuit],
-    file: LawParameters,
 ) -> CalibrationReport:
-    """Return the report of a fit.
+    """Return the report of a fit of one sheet.
 
     before: errors of the forces that the daemon published; after: expected for the same readings under the
-    new law, with the contact radius of the deployment file.
+    new law by this sheet alone, with the contact radius of the deployment file.
     """
     after = [
-        reported_force(fit.law, circuit_model, reading, circuit) / reading.weight.force_n - 1
+        reported_force(fit.law, sheet, reading, circuit) / reading.apparent_n - 1
         for reading, circuit in zip(readings, circuits, strict=True)
     ]
     before = [reading.reported_force_n / reading.weight.force_n - 1 for reading in readings]
@@ -73,15 +86,15 @@ def build_report(
         rows.append(
             WeightErrors(weight.name, weight.force_n, len(chosen), float(current.mean()), scatter, *errors)
         )
-    return CalibrationReport(pad, fit, tuple(rows), _rms(before), _rms(after), file)
+    return CalibrationReport(pad, fit, tuple(rows), _rms(before), _rms(after), law_of(sheet))
 
 
 def reported_force(
-    law: LawParameters, circuit_model: PadCircuitModel, reading: WeightReading, circuit: ContactCircuit
+    law: LawParameters, sheet: config.Sheet, reading: WeightReading, circuit: ContactCircuit
 ) -> float:
-    """Return the force [N] that the daemon estimates for a reading under a law; NaN above the sheet's
-    limit."""
-    estimate = contact_law(circuit_model.sheet, law).force(
+    """Return the force [N] that the daemon estimates for a reading of a sheet under a law; NaN above the
+    sheet's limit."""
+    estimate = contact_law(sheet, law).force(
         reading.current_a, circuit.drive_v, law.ohm_per_square, circuit.spreading_m, circuit.series_ohm
     )
     return float(estimate.force_n)
@@ -89,7 +102,6 @@ def reported_force(
 
 def format_text(report: CalibrationReport) -> str:
     """Return the report as text."""
-    fit, law = report.fit, report.fit.law
     lines = [
         f"{'weight':>16} {'n':>3} {'mA':>9} {'scatter':>8} {'before':>8} {'after':>8}   force error, rms"
     ]
@@ -104,7 +116,15 @@ def format_text(report: CalibrationReport) -> str:
     lines.append(
         f"{'all':>39} {_percent(report.force_error_before):>8} {_percent(report.force_error_after):>8}"
     )
-    lines.append("")
+    lines += ["", *_law_lines(report)]
+    if report.second is not None:
+        lines += ["", "second sheet", *_law_lines(report.second)]
+    return "\n".join([*lines, *(f"Not enough: {problem}." for problem in report.problems)])
+
+
+def _law_lines(report: CalibrationReport) -> list[str]:
+    """Return the law of a sheet with its intervals, and remarks."""
+    fit, law, lines = report.fit, report.fit.law, list[str]()
     for name in PARAMETERS:
         value, interval, file = getattr(law, name), fit.intervals[name], getattr(report.default_law, name)
         kept = "  (not observed)" if name == "ohm_per_square" and not fit.sheet_observed else ""
@@ -114,9 +134,7 @@ def format_text(report: CalibrationReport) -> str:
         )
     lines += _radius_lines(report)
     lines.append(f"{'scatter':<16} {fit.scatter:>9.1%}  from press to press, of the load")
-    lines += [f"Note: {remark}." for remark in fit.remarks]
-    lines += [f"Not enough: {problem}." for problem in fit.problems]
-    return "\n".join(lines)
+    return [*lines, *(f"Note: {remark}." for remark in fit.remarks)]
 
 
 def _radius_lines(report: CalibrationReport) -> list[str]:
@@ -154,6 +172,7 @@ def to_json(report: CalibrationReport, **more: Any) -> dict[str, Any]:
         "weights": [asdict(row) for row in report.weight_errors],
         "problems": list(fit.problems),
         "remarks": list(fit.remarks),
+        **({} if report.second is None else {"second_sheet": to_json(report.second)}),
         **more,
     }
 

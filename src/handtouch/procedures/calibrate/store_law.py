@@ -9,7 +9,6 @@ import platform
 from datetime import datetime
 from pathlib import Path
 
-import handtouch
 from handtouch import config
 from handtouch.calibration.calibration import (
     Calibration,
@@ -18,11 +17,12 @@ from handtouch.calibration.calibration import (
     channel_values,
 )
 from handtouch.calibration.store import Store, StoreError
-from handtouch.host.user import user_name
+from handtouch.host.user import program_name
 from handtouch.procedures.calibrate.recording import RecordingHeader
 from handtouch.procedures.calibrate.report import CalibrationReport
 
 METHOD = "guided session"
+_MAX_NAMED_WEIGHTS = 12
 
 
 def store_law(
@@ -32,7 +32,7 @@ def store_law(
     report: CalibrationReport,
     now: datetime,
 ) -> str:
-    """Store the law measured on a pad in the store at `path`; return its calibration_id.
+    """Store the laws measured on a pad in the store at `path`; return its calibration_id.
 
     Gains and sheet state of the newest version stay, if they are this node's under these tables; offsets are
     those of the tare. Raises StoreError, also for a node without a serial number.
@@ -40,8 +40,9 @@ def store_law(
     hand, table = pad
     if header.serial is None:
         raise StoreError(f"{report.pad}: its node has no serial number; a calibration is bound to one")
-    fit = report.fit
-    weights = ", ".join(row.weight for row in report.weight_errors)
+    fit, second = report.fit, report.second
+    names = [row.weight for row in report.weight_errors]
+    weights = ", ".join(names) if len(names) <= _MAX_NAMED_WEIGHTS else f"{names[0]} to {names[-1]}"
     provenance = Provenance(
         METHOD,
         contacts=len(fit.residuals),
@@ -49,21 +50,20 @@ def store_law(
         hand=hand,
         link=table.link,
         host=platform.node(),
-        program=f"{user_name()}, handtouch {handtouch.__version__}",
+        program=program_name(),
         note=f"weights {weights}; scatter {fit.scatter:.1%}; sheet "
         f"{'' if fit.sheet_observed else 'not '}observed; radius "
-        f"{'constant' if fit.law.hertz_force_n is None else 'by Hertz'}, evidence {fit.evidence:+.1f}",
+        f"{'constant' if fit.law.hertz_force_n is None else 'by Hertz'}, evidence {fit.evidence:+.1f}"
+        f"{'' if second is None else f'; second sheet: scatter {second.fit.scatter:.1%}'}",
     )
     with Store(path) as store:
         newest = store.newest(header.serial, header.default_calibration_id)
-        own = (
-            newest is not None
-            and newest.config == header.default_calibration_id
-            and not newest.provenance.foreign
-        )
+        own = newest is not None and newest.is_own(header.default_calibration_id)
         known = newest.calibration if newest is not None and own else Calibration()
         offsets = known.offsets
         if len(header.zero) == 2:
             offsets = Offsets(channel_values(header.zero[0]), channel_values(header.zero[1]))
-        made = Calibration(known.gains, offsets, fit.law, known.sheet)
+        made = Calibration(
+            known.gains, offsets, fit.law, known.sheet, None if second is None else second.fit.law
+        )
         return store.write(header.serial, header.default_calibration_id, made, provenance, now).calibration_id

@@ -23,7 +23,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
 from handtouch.config.tables import SIDE_ELECTRODES
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 from handtouch.field.surface import Surface
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,7 @@ _GRID_CELLS = 32  # cells along a side
 _MAX_MISFIT_VARIANCES = 25.0  # beyond this, no position explains a press
 
 
-def target_fractions(network: ElectrodeNetwork) -> FloatArray:
+def target_fractions(network: ChannelModel) -> FloatArray:
     """Return the positions (c, 2) of presses near each electrode, as fractions of the pad's rectangle."""
     centres = network.centres / (network.a, network.b)
     return centres + _INWARD * (0.5 - centres)
@@ -66,7 +66,7 @@ class ShareGrid:
     """
 
     def __init__(
-        self, model: ElectrodeNetwork, surface: Surface, electrodes: tuple[str, ...] = SIDE_ELECTRODES
+        self, model: ChannelModel, surface: Surface, electrodes: tuple[str, ...] = SIDE_ELECTRODES
     ) -> None:
         middle = (np.arange(_GRID_CELLS) + 0.5) / _GRID_CELLS
         s, t = np.meshgrid(middle, middle, indexing="ij")

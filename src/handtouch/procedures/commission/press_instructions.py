@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 from handtouch.hand import mount_transform, pad_surface
 from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, target_fractions
 
@@ -41,7 +41,7 @@ def describe_press(pad: config.Pad, electrode: str) -> str:
     return f"{describe_position(pad, electrode)}; in the middle {across} ({_coordinates(position)})"
 
 
-def describe_arc_press(pad: config.Pad, network: ElectrodeNetwork, electrode: str) -> str:
+def describe_arc_press(pad: config.Pad, network: ChannelModel, electrode: str) -> str:
     """Describe a position near an electrode on an arc: "the rim towards +y of the link (about x ...)"."""
     fractions = target_fractions(network)[pad.electrode_names.index(electrode)]
     surface, (rotation, translation) = pad_surface(pad), mount_transform(pad)

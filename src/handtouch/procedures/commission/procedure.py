@@ -20,7 +20,7 @@ from handtouch.canbus.nodes.spec import NodeStatus
 from handtouch.config.channels import node_channels
 from handtouch.core.least_threshold import begin_samples, least_begin_counts
 from handtouch.core.pad_model import PadModel
-from handtouch.hand import pad_network, pad_surface
+from handtouch.hand import pad_channels, pad_surface
 from handtouch.procedures.commission import press_instructions as words
 from handtouch.procedures.commission.channel_bars import render_channel_bars
 from handtouch.procedures.commission.deployment_edit import PadEdit
@@ -106,9 +106,9 @@ class CommissioningProcedure(GuidedProcedure[HandSample]):
             for kind, most in zip(kinds, self._max_counts, strict=True)
         ]
         self._period_ns = round(1e6 * deployment.daemon.sync_period_ms)
-        touches = [outcome.pad.touch or deployment.touch for outcome in self.outcomes]
         self._begin_samples = [
-            begin_samples(round(1e6 * touch.begin_ms), self._period_ns) for touch in touches
+            begin_samples(deployment.touch_of(outcome.pad).begin_ms, self._period_ns)
+            for outcome in self.outcomes
         ]
         self._model = cache(partial(PadModel, deployment))
         self._detector: PressDetector
@@ -405,12 +405,12 @@ class CommissioningProcedure(GuidedProcedure[HandSample]):
     def _describe_press(self, pad: config.Pad, electrode: str) -> str:
         if not pad.arcs_mm:
             return words.describe_press(pad, electrode)
-        network = pad_network(pad, self._deployment.sheets[pad.sheet])
+        network = pad_channels(pad, self._deployment.sheet_of(pad), self._deployment.nodes[pad.node])
         return words.describe_arc_press(pad, network, electrode)
 
     def _make_share_grid(self, row: int) -> ShareGrid:
         pad = self.outcomes[row].pad
-        network = pad_network(pad, self._deployment.sheets[pad.sheet])
+        network = pad_channels(pad, self._deployment.sheet_of(pad), self._deployment.nodes[pad.node])
         return ShareGrid(network, pad_surface(pad), pad.electrode_names)
 
     def _node_text(self, slot: int) -> str:

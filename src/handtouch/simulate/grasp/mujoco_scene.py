@@ -1,13 +1,14 @@
 """MuJoCo model of a deployment's hand and an object: bodies of the URDF, with pads at their true mounting.
 
-Public names: `MujocoScene`, `MujocoPad`. MuJoCo reads the URDF itself; each pad's surface is a geom of the
-same shape, a skin on the link's body. Parts of the hand don't collide with each other.
+Public names: `MujocoScene`, `MujocoPad`; `hand_spec`, `Motor`, `add_motors`, `set_solver_options`,
+`quaternion`, of which other scenes are made. MuJoCo reads the URDF itself; each pad's surface is a geom of
+the same shape, a skin on the link's body. Parts of the hand don't collide with each other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,24 @@ TIME_STEP_S = 1e-3
 _SKIN_THICKNESS_M = 1.5e-3  # URDF bodies are shrunk by this, so that objects touch the pads
 _PLATE_HALF_THICKNESS_M = 2e-3
 _CIRCLE_VERTICES = 96  # vertices of a frustum's circles
-_HAND_COLLISION_BIT, _OBJECT_COLLISION_BIT = 1, 2
-_STIFFNESS_NM, _DAMPING_NM_S = 1.5, 0.03
+HAND_COLLISION_BIT, OBJECT_COLLISION_BIT = 1, 2
 _CONTACT_TIME_CONSTANT_S = 5e-3  # soft contact, as of a skin
 _GRAVITY_M_S2 = 9.81
+
+
+@dataclass(frozen=True)
+class Motor:
+    """Position-controlled motor of a joint, and the joint that it drives."""
+
+    stiffness_nm: float
+    damping_nm_s: float
+    max_torque_nm: float
+    armature_kg_m2: float
+    joint_damping_nm_s: float
+
+
+_MOTOR = Motor(1.5, 0.03, np.inf, 1e-4, 0.005)
+"""Of a grasp; the object states the torque"""
 
 
 @dataclass(frozen=True)
@@ -52,32 +67,16 @@ class MujocoScene:
     def __init__(self, hand: config.HandTable, world: DrawnWorld, grasp_object: GraspObject) -> None:
         import mujoco
 
-        if not hand.urdf:
-            raise ValueError(f'hand "{hand.name}" has no URDF, which a grasp needs: set urdf in [[hand]]')
         self.grasp_object = grasp_object
-        spec: Any = mujoco.MjSpec.from_file(str(Path(hand.urdf)))
-        spec.compiler.fusestatic = False
-        self.joints = tuple(joint.name for joint in spec.joints)
+        spec, self.joints = hand_spec(hand, world, grasp_object.friction)
         if not any(name.endswith(f"_{end}") for name in self.joints for end in grasp_object.closed_deg):
             ends = ", ".join(f"_{end}" for end in grasp_object.closed_deg)
             has = ", ".join(self.joints)
             raise ValueError(f'hand "{hand.name}" can\'t grasp: no joint ends in {ends}; its joints: {has}')
-        for geom in spec.geoms:
-            _shrink_geom(mujoco, geom)
         mounts = {pad.link: world.mount(hand.name, pad) for pad in hand.pads}
         shapes = {pad.link: world.surface(hand.name, pad) for pad in hand.pads}
-        for pad in hand.pads:
-            _add_pad(
-                mujoco, spec, spec.body(pad.mount.link or pad.link), pad, shapes[pad.link], *mounts[pad.link]
-            )
-        for geom in spec.geoms:
-            geom.contype, geom.conaffinity, geom.friction[0] = (
-                _HAND_COLLISION_BIT,
-                _OBJECT_COLLISION_BIT,
-                grasp_object.friction,
-            )
-        _add_motors(mujoco, spec, self.joints, grasp_object)
-        _set_solver_options(mujoco, spec)
+        add_motors(mujoco, spec, self.joints, replace(_MOTOR, max_torque_nm=grasp_object.max_torque_nm))
+        set_solver_options(mujoco, spec)
         hand_only = spec.compile()
         data = mujoco.MjData(hand_only)
         mujoco.mj_forward(hand_only, data)
@@ -111,6 +110,28 @@ class MujocoScene:
         return np.asarray((points_m - self.palm_m) @ self.palm_rotation)
 
 
+def hand_spec(hand: config.HandTable, world: DrawnWorld, friction: float) -> tuple[Any, tuple[str, ...]]:
+    """Return an MjSpec of a hand with its pads, which touch only objects, and the names of its joints.
+
+    Raises ValueError for a hand without URDF.
+    """
+    import mujoco
+
+    if not hand.urdf:
+        raise ValueError(f'hand "{hand.name}" has no URDF, which a grasp needs: set urdf in [[hand]]')
+    spec: Any = mujoco.MjSpec.from_file(str(Path(hand.urdf)))
+    spec.compiler.fusestatic = False
+    for geom in spec.geoms:
+        _shrink_geom(mujoco, geom)
+    for pad in hand.pads:
+        body = spec.body(pad.mount.link or pad.link)
+        _add_pad(mujoco, spec, body, pad, world.surface(hand.name, pad), *world.mount(hand.name, pad))
+    for geom in spec.geoms:
+        geom.contype, geom.conaffinity = HAND_COLLISION_BIT, OBJECT_COLLISION_BIT
+        geom.friction[0], geom.condim, geom.solref = friction, 4, [_CONTACT_TIME_CONSTANT_S, 1.0]
+    return spec, tuple(joint.name for joint in spec.joints)
+
+
 def _shrink_geom(mujoco: Any, geom: Any) -> None:
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         geom.size = np.asarray(geom.size) - _SKIN_THICKNESS_M
@@ -135,7 +156,7 @@ def _add_pad(
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, geom.name
         spec.add_mesh(name=geom.name, uservert=np.ravel(shape.hull_points()))
     geom.pos = translation - depth_m * rotation[:, 2]
-    geom.quat = _quaternion(mujoco, rotation @ turn)
+    geom.quat = quaternion(mujoco, rotation @ turn)
 
 
 def _box(mujoco: Any, geom: Any, shape: SimulatedSurface) -> tuple[float, FloatArray]:
@@ -170,7 +191,7 @@ def _add_object(
     """Add the object, free to move, and a holder that can hold it."""
     pose = {
         "pos": palm_m + palm_rotation @ grasped.position_m,
-        "quat": _quaternion(mujoco, palm_rotation @ rotation_from_rpy(np.radians(grasped.rpy_deg))),
+        "quat": quaternion(mujoco, palm_rotation @ rotation_from_rpy(np.radians(grasped.rpy_deg))),
     }
     body = spec.worldbody.add_body(name="object", **pose)
     body.add_freejoint()
@@ -208,37 +229,36 @@ def _add_object(
 def _add_object_geom(body: Any, grasped: GraspObject, name: str) -> Any:
     geom = body.add_geom(name=name)
     geom.contype, geom.conaffinity, geom.friction[0] = (
-        _OBJECT_COLLISION_BIT,
-        _HAND_COLLISION_BIT,
+        OBJECT_COLLISION_BIT,
+        HAND_COLLISION_BIT,
         grasped.friction,
     )
     geom.condim = 4
     return geom
 
 
-def _add_motors(mujoco: Any, spec: Any, joints: Sequence[str], grasp_object: GraspObject) -> None:
+def add_motors(mujoco: Any, spec: Any, joints: Sequence[str], motor: Motor) -> None:
     """Add a position-controlled motor with limited torque to every joint."""
     for name in joints:
         joint = spec.joint(name)
-        joint.armature, joint.damping[0] = 1e-4, 0.005
-        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
-        motor.gainprm[0] = _STIFFNESS_NM
-        motor.biasprm[1], motor.biasprm[2] = -_STIFFNESS_NM, -_DAMPING_NM_S
-        motor.forcelimited, motor.forcerange = True, [-grasp_object.max_torque_nm, grasp_object.max_torque_nm]
+        joint.armature, joint.damping[0] = motor.armature_kg_m2, motor.joint_damping_nm_s
+        made = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made.gaintype, made.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+        made.gainprm[0] = motor.stiffness_nm
+        made.biasprm[1], made.biasprm[2] = -motor.stiffness_nm, -motor.damping_nm_s
+        made.forcelimited, made.forcerange = True, [-motor.max_torque_nm, motor.max_torque_nm]
 
 
-def _set_solver_options(mujoco: Any, spec: Any) -> None:
+def set_solver_options(mujoco: Any, spec: Any) -> None:
+    """Set time step and solver as hands that touch need them."""
     spec.option.timestep = TIME_STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
-    for geom in spec.geoms:
-        geom.condim = 4
-        geom.solref = [_CONTACT_TIME_CONSTANT_S, 1.0]
 
 
-def _quaternion(mujoco: Any, rotation: FloatArray) -> FloatArray:
+def quaternion(mujoco: Any, rotation: FloatArray) -> FloatArray:
+    """Return the quaternion (4,) of a rotation (3, 3), in MuJoCo's order."""
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
     return quat

@@ -90,8 +90,9 @@ class ContactReader:
         # rows of a contact's frame: its normal, from the first geom to the second, and two tangents
         on_second = np.einsum("ki,kij->kj", forces[:, :3], frames)
         on_link = np.where(side[:, None] == 1, on_second, -on_second)
-        rotation = np.stack([data.xmat for data in found])[owner, bodies].reshape(k, 3, 3)
-        origin = np.stack([data.xpos for data in found])[owner, bodies]
+        at = owner * self._model.nbody + bodies
+        rotation = np.concatenate([data.xmat for data in found])[at].reshape(k, 3, 3)
+        origin = np.concatenate([data.xpos for data in found])[at]
         position = np.concatenate([each.pos for each in contacts])[contact]
         return LinkPoints(
             np.array(touched)[owner],

@@ -49,6 +49,22 @@ class TactileReading:
     mount_covariance_m2: NDArray[np.float32]
     """(p, 3, 3), part of `covariance_m2` by the pad's mount on its link, row by row: the same error in all
     contacts of the pad, so that the difference of two positions has the rest"""
+    contact_radius_status: NDArray[np.uint8]
+    """(p,), status of the contact's radius"""
+    contact_radius_m: NDArray[np.float32]
+    """(p,), radius of the contact"""
+    contact_radius_std_m: NDArray[np.float32]
+    """(p,), its standard deviation"""
+    length_m: NDArray[np.float32]
+    """(p,), length of the line that is as elongated; NaN where nothing is known of it"""
+    min_length_m: NDArray[np.float32]
+    """(p,), lower end of its interval of 95 %"""
+    max_length_m: NDArray[np.float32]
+    """(p,), upper end of its interval of 95 %"""
+    length_axis: NDArray[np.float32]
+    """(p, 3), unit vector along it, in the link's frame"""
+    length_axis_std_rad: NDArray[np.float32]
+    """(p,), standard deviation of its direction"""
 
     @property
     def touched(self) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from handtouch.simulate.tactile.simulated_pads import SimulatedPads
 from handtouch.simulate.worlds import World, world_named
 from handtouch.wire import PadState
 
-_HANDS_PER_PIPELINE = 16
+_HANDS_PER_PIPELINE = 64
 """Environments that share a tick: enough to spread the cost of a call, and few enough for the caches"""
 _START_NS = 1_000_000_000
 _NOISE_SEEDS = 4096  # later ones repeat: times must not reach the hours in which drift matters
@@ -58,11 +58,14 @@ class TactileSensor:
         if environments < 1:
             raise ValueError(f"environments = {environments}: must be 1 or more")
         seeds = [seed] if isinstance(seed, int) else list(seed)
+        deployment = _with_electrodes_only(deployment)
         self.links = deployment.pad_names
         self.environments = environments
         self.period_s = 1e-3 * deployment.daemon.sync_period_ms if period_s is None else period_s
         self._period_ns = round(1e9 * self.period_s)
         pads = [entry.pad for entry in deployment.pads]
+        if others := [entry.name for entry in deployment.pads if entry.pad.response]:
+            raise ValueError(f"{', '.join(others)}: only sheets with electrodes are simulated with MuJoCo")
         self._reader = ContactReader(pads, model, bodies or {})
         drawn = [world_named(world).draw(number) for number in seeds[:environments]]
         self._members = [np.arange(first, environments, len(drawn)) for first in range(len(drawn))]
@@ -241,15 +244,20 @@ def _pipelines(deployment: config.Deployment, environments: int, period_ns: int)
 
 
 def _repeated(deployment: config.Deployment, count: int) -> config.Deployment:
-    """Return a deployment with copies of its hands, without shear pads: MuJoCo's contacts give their normal
-    forces only."""
-    without = {
-        hand.name: tuple(pad.model_copy(update={"shear": None}) for pad in hand.pads)
-        for hand in deployment.hands
-    }
+    """Return a deployment with copies of its hands."""
     hands = tuple(
-        hand.model_copy(update={"name": f"{hand.name}.{number}", "pads": without[hand.name]})
+        hand.model_copy(update={"name": f"{hand.name}.{number}"})
         for number in range(count)
+        for hand in deployment.hands
+    )
+    return deployment.model_copy(update={"hands": hands})
+
+
+def _with_electrodes_only(deployment: config.Deployment) -> config.Deployment:
+    """Return a deployment without shear pads and second sheets: a reading has four channels."""
+    left_out = {"shear": None, "second_sheet": None}
+    hands = tuple(
+        hand.model_copy(update={"pads": tuple(pad.model_copy(update=left_out) for pad in hand.pads)})
         for hand in deployment.hands
     )
     return deployment.model_copy(update={"hands": hands})

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.contact_patch import discs as evenly_pressed
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
 from handtouch.simulate.grasp.patches import pad_discs, project_points
-from handtouch.simulate.stimulus import AppliedContact
+from handtouch.simulate.stimulus import AppliedContact, EventlessStimulus
 from handtouch.simulate.tactile.live_sheet import LiveSheets
 from handtouch.simulate.tactile.mujoco_contacts import LinkPoints
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -188,23 +187,13 @@ class _Snapshots:
         return np.zeros((2, len(times_s)))
 
 
-class _NoStimulus:
+class _NoStimulus(EventlessStimulus):
     """A stimulus without contacts: those of a running simulation are given to each sample."""
 
-    faults = ()
-    node_faults = ()
-    node_replacements = ()
-    skin: Skin | None = None
-    turns: Sequence[BaseTurn] = ()
-    repeat = False
-    duration_s = np.inf
     touch_links: Sequence[str] = ()
 
     def contacts_at(self, t_s: float) -> list[AppliedContact]:  # noqa: ARG002
         return []
-
-    def touch_patch(self, number: int, drawn: ContactPatch) -> ContactPatch:  # noqa: ARG002
-        return drawn
 
     def pad_stimulus(self, link: str, patch: Callable[[int], ContactPatch]) -> _Snapshots:  # noqa: ARG002
         return _Snapshots(np.zeros((0, 2, 0)), np.zeros((0, 0)), evenly_pressed(np.zeros((0, 0))))

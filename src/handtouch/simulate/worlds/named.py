@@ -10,9 +10,11 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from handtouch.simulate.contact_patch import PROFILES
+from handtouch.simulate.preisach import PlayLoops
 from handtouch.simulate.worlds.distributions import Fixed, LogNormal, LogUniform, Normal, OneOf, Uniform
+from handtouch.simulate.worlds.response_spread import ResponseSpread
 from handtouch.simulate.worlds.shear_spread import ShearSpread
-from handtouch.simulate.worlds.sheet_kinds import SHEET_KINDS, SheetKind
+from handtouch.simulate.worlds.sheet_kinds import ELASTOMER, SHEET_KINDS, SheetKind
 from handtouch.simulate.worlds.spreads import (
     ONE,
     ContactSpread,
@@ -83,6 +85,16 @@ _DEFAULT = World(
         creep=Uniform(0.02, 0.05),
         stiffening=Uniform(0.0, 0.05),
     ),
+    ResponseSpread(
+        position_offset_mm=Normal(0.0, 0.2),
+        width_ratio=LogNormal(1.0, 0.05),
+        signal_ratio=LogNormal(1.0, 0.08),
+        crosstalk=Uniform(0.0, 0.02),
+        tail=Uniform(0.0, 0.1),
+        field_n=LogNormal(0.3, 0.3),
+        field_tilt=Normal(0.0, 0.1),
+        kind=ELASTOMER,
+    ),
 )
 
 _HARSH = World(
@@ -143,6 +155,16 @@ _HARSH = World(
         hysteresis=Uniform(0.05, 0.15),
         creep=Uniform(0.05, 0.13),
         stiffening=Uniform(0.0, 0.12),
+    ),
+    ResponseSpread(
+        position_offset_mm=Normal(0.0, 0.5),
+        width_ratio=LogNormal(1.0, 0.12),
+        signal_ratio=LogNormal(1.0, 0.2),
+        crosstalk=Uniform(0.0, 0.05),
+        tail=Uniform(0.0, 0.25),
+        field_n=LogNormal(0.3, 0.6),
+        field_tilt=Normal(0.0, 0.25),
+        kind=replace(ELASTOMER, law=replace(ELASTOMER.law, hysteresis=PlayLoops(0.15, 5.0))),
     ),
 )
 

@@ -1,6 +1,6 @@
 """Kinds of sheets: nominal behaviour of a material.
 
-Public names: `SheetKind`, `SHEET_KINDS` by name. docs/worlds.md states the source of each number.
+Public names: `SheetKind`, `SHEET_KINDS` by name, `ELASTOMER`. docs/worlds.md has the source of each number.
 The presets of `handtouch.sheet` repeat those of S1 and S2, so that a change of what is compensated doesn't
 change what is simulated.
 """
@@ -100,6 +100,19 @@ _CONDUCTIVE_FILM = SheetLaw(
     press_std=0.1,
     noise_std=0.01,
 )
+ELASTOMER = SheetKind(
+    "elastomer",
+    SheetLaw(
+        BackForces(),
+        ElementCreep(0.95, (0.03, 0.02), (0.5, 30.0)),
+        PlayLoops(0.06, _HYSTERESIS_FULL_N),
+        gain_per_k=0.002,
+        press_std=0.02,
+        noise_std=0.002,
+    ),
+    Behaviour(preset="unknown"),
+)
+"""Cover of sensors other than sheets: silicone rubber, loops some 6 % wide; nothing has a model of it."""
 
 
 def _film_behaviour(law: SheetLaw, width: float, **creep: float) -> Behaviour:

@@ -103,6 +103,10 @@ class ElectronicsSpread:
     """Share of the channel converted before that a channel reads, one value per pad."""
     nonlinearity_counts: Distribution = ZERO
     """Amplitude of a channel's error by its converter's non-linearity."""
+    zero_counts: Distribution = ZERO
+    """Reading of a channel without current at the start."""
+    warm_up_k: Distribution = ZERO
+    """Temperature by which the hand warms, evenly, in the two minutes after its start."""
     zero_drift_counts_per_s: Distribution = ZERO
     """Maximum drift rate of a channel's zero, one value per hand; channels drift independently."""
     temperature_drift_k_per_s: Distribution = ZERO

@@ -20,6 +20,7 @@ from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.worlds.distributions import Distribution
 from handtouch.simulate.worlds.families import Family
+from handtouch.simulate.worlds.response_spread import HiddenResponse, ResponseSpread
 from handtouch.simulate.worlds.shear_spread import HiddenShear, ShearSpread
 from handtouch.simulate.worlds.sheet_kinds import SheetKind
 from handtouch.simulate.worlds.spreads import (
@@ -51,6 +52,7 @@ class World:
     sheets: SheetSpread = field(default_factory=SheetSpread)
     electronics: ElectronicsSpread = field(default_factory=ElectronicsSpread)
     shear: ShearSpread = field(default_factory=ShearSpread)
+    responses: ResponseSpread = field(default_factory=ResponseSpread)
 
     def draw(self, seed: int) -> DrawnWorld:
         """Return the world of one seed; raises ValueError for a seed of no `Family`."""
@@ -190,7 +192,7 @@ class DrawnWorld:
             mount_rotation_deg=_three(mounts.orientation_deg.sample(mount, 3)),
             contact_ohm_ratio=self._number(sheets.contact_ohm_ratio, "contact_ohm", link),
             alpha_offset=self._number(sheets.alpha_offset, "alpha", link),
-            sheet_law=self._sheet_law(link, pad.sheet),
+            sheet_law=self._sheet_law(link, self._kind_of(pad)),
             noise_ratio=self._number(electronics.noise_ratio, "noise_ratio", link),
             offset_counts_per_k=_floats(self.offset_counts_per_k(link, count)),
             gain_per_k=_floats(self.gain_per_k(link, count)),
@@ -236,6 +238,19 @@ class DrawnWorld:
             contacts.profile.names[int(contacts.profile.sample(patch, 1)[0])],
         )
 
+    def response(self, pad_name: str, count: int) -> HiddenResponse:
+        """Return the properties of the n channels of a pad, "hand/link", that isn't a sheet."""
+        return HiddenResponse.draw(
+            self.world.responses,
+            count,
+            lambda spread, size, name: self._numbers(spread, size, "response", name, pad_name),
+        )
+
+    def magnetic_field(self, hand: str) -> FloatArray:
+        """Return the direction (3,) of the Earth's field in a hand's base at the start."""
+        field = self._stream("magnetic_field", hand).normal(size=3)
+        return np.asarray(field / np.linalg.norm(field))
+
     def shear(self, pad_name: str) -> HiddenShear:
         """Return the properties of the shear pattern and layer of a pad, "hand/link"."""
         return HiddenShear.draw(
@@ -255,9 +270,10 @@ class DrawnWorld:
         std_deg = float(np.hypot(mounts.joint_offset_deg.std, noise_deg))
         return HiddenJoints(tuple(offsets.tolist()), float(noise_deg), float(delay_s), std_deg)
 
-    def replacement_gain(self, serial: int) -> PerElectrode:
+    def replacement_gain(self, serial: int, count: int = 4) -> PerElectrode:
         """Return the channel gains of a replacement node."""
-        return _floats(self.world.parts.gain_ratio.sample(np.random.default_rng((self.seed, serial, 1)), 4))
+        rng = np.random.default_rng((self.seed, serial, 1))
+        return _floats(self.world.parts.gain_ratio.sample(rng, count))
 
     def sheet_kind(self, sheet: str) -> SheetKind | None:
         """Return the kind of the file's sheets of a name; None: ideal."""
@@ -292,7 +308,9 @@ class DrawnWorld:
             sheets[name] = sheet.model_copy(update=of_sheet | behaviour)
         nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
         shears = {name: self.world.shear.describe(shear) for name, shear in deployment.shears.items()}
-        return deployment.model_copy(update={"sheets": sheets, "nodes": nodes, "shears": shears})
+        update = {"sheets": sheets, "nodes": nodes, "shears": shears}
+        of_films = of_sheet | {"lead_std_ohm": of_node["series_std_ohm"]}
+        return self.world.responses.describe(deployment.model_copy(update=update), of_films)
 
     def lead_ohm(self, pad_name: str, count: int = 4) -> FloatArray:
         """Return the resistances (count,) of the leads of a pad's electrodes, "hand/link" [ohm]."""
@@ -314,6 +332,10 @@ class DrawnWorld:
             self.world.electronics.offset_counts_per_k, count, "offset_counts_per_k", pad_name
         )
 
+    def zero_counts(self, pad_name: str, count: int = 4) -> FloatArray:
+        """Return the zeros (count,) of the channels of a pad, "hand/link", at the start."""
+        return self._numbers(self.world.electronics.zero_counts, count, "zero_counts", pad_name)
+
     def gain_per_k(self, pad_name: str, count: int = 4) -> FloatArray:
         """Return the relative temperature coefficients (count,) of the gains of a pad, "hand/link"."""
         return self._numbers(self.world.electronics.gain_per_k, count, "gain_per_k", pad_name)
@@ -327,10 +349,11 @@ class DrawnWorld:
         factors = self._numbers(self.world.sheets.parameter_ratio, 6, "sheet", pad_name)
         return [float(factor) for factor in factors]
 
-    def _sheet_law(self, pad_name: str, sheet: str) -> SheetLaw | None:
-        if (kind := self.sheet_kind(sheet)) is None:
-            return None
-        return kind.varied(*self.sheet_factors(pad_name))
+    def _kind_of(self, pad: config.Pad) -> SheetKind | None:
+        return self.world.responses.kind if pad.response else self.sheet_kind(pad.sheet)
+
+    def _sheet_law(self, pad_name: str, kind: SheetKind | None) -> SheetLaw | None:
+        return kind.varied(*self.sheet_factors(pad_name)) if kind else None
 
     def _number(self, distribution: Distribution, *names: str) -> float:
         return float(self._numbers(distribution, 1, *names)[0])
@@ -344,8 +367,14 @@ class DrawnWorld:
 
 
 _PARTS_OF_SHEET = (
-    *("gap_before_mm", "gap_after_mm", "sheet_ohm_ratio", "anisotropy_ratio", "unevenness"),
-    *("contact_ohm_ratio", "alpha_offset", "sheet_law"),
+    "gap_before_mm",
+    "gap_after_mm",
+    "sheet_ohm_ratio",
+    "anisotropy_ratio",
+    "unevenness",
+    "contact_ohm_ratio",
+    "alpha_offset",
+    "sheet_law",
 )
 """Properties of a pad that a new sheet on the same node changes."""
 

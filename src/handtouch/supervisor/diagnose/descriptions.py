@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from handtouch.config.tables import SIDE_ELECTRODES
+from handtouch.field.estimate import estimate
 from handtouch.supervisor.diagnose.channel_faults import ChannelFault
 from handtouch.supervisor.diagnose.contact_faults import ContactFault
 from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrode
@@ -30,6 +31,10 @@ _STATIC_LOAD_TEXTS = {
     FaultKind.GUM: (
         "an object sticks to the pad, like gum: a contact of constant position and force, without tremor",
         "inspect and clean the pad; until then, contacts elsewhere on it are merged with this one",
+    ),
+    FaultKind.STATIC_LOAD: (
+        "static load, probably gum ({probability:.0%}), or an object that is held still",
+        "look whether something sticks to the pad; touches elsewhere on it tell which",
     ),
     FaultKind.HYSTERESIS_TAIL: (
         "the remainder of a press fades only slowly",
@@ -113,6 +118,7 @@ def describe_static_load(
     size: float | None = None
     if is_located and kind in (
         FaultKind.GUM,
+        FaultKind.STATIC_LOAD,
         FaultKind.MOISTURE,
         FaultKind.HELD_OBJECT,
         FaultKind.HYSTERESIS_TAIL,
@@ -120,7 +126,7 @@ def describe_static_load(
         position, radius_m = _load_position(model, pad, load.level_counts)
         size = 2 * radius_m if kind == FaultKind.GUM and radius_m is not None else None
     cause, remedy = _STATIC_LOAD_TEXTS[kind]
-    cause = cause.format(electrodes=" and ".join(names))
+    cause = cause.format(electrodes=" and ".join(names), probability=load.probability)
     if position is not None:
         along, across = (f"{1e3 * at:.0f} mm" for at in position)
         by_arcs = model.electrodes[pad] != SIDE_ELECTRODES
@@ -141,8 +147,8 @@ def describe_static_load(
         min(max(load.probability, 0.0), 1.0),
         position,
         size,
-        position_valid=kind in (FaultKind.HELD_OBJECT, FaultKind.HYSTERESIS_TAIL),
-        force_valid=kind == FaultKind.HELD_OBJECT,
+        position_valid=kind in (FaultKind.HELD_OBJECT, FaultKind.STATIC_LOAD, FaultKind.HYSTERESIS_TAIL),
+        force_valid=kind in (FaultKind.HELD_OBJECT, FaultKind.STATIC_LOAD),
     )
     return PadDiagnosis(published, model.links[pad], values, names)
 
@@ -257,7 +263,7 @@ def _load_position(
     network, sheet = model.networks[pad], model.sheets[pad]
     current = level_counts * model.ampere_per_count[pad, : len(level_counts)]
     noise = float(model.noise_counts[pad] * model.ampere_per_count[pad].max())
-    found = network.estimate(current, noise)
+    found = estimate(network, current, noise)
     if not (np.isfinite(found.x) and np.isfinite(found.y)):  # one of them alone places nothing
         return None, None
     u, v = model.surfaces[pad].from_rectangle(float(found.x), float(found.y))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel
 from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, HandSamples
 
 GROUP_SAMPLES = 5
@@ -65,7 +65,7 @@ def extract_features(block: HandSamples, model: DiagnosisModel, offset_counts: F
     )
 
 
-def electrode_weights(network: ElectrodeNetwork) -> FloatArray:
+def electrode_weights(network: ChannelModel) -> FloatArray:
     """Return the weights (2, 2, c) with which `approximate_position` takes a pad's channels.
 
     Along each side, an electrode counts by its distance from the middle: opposite sides by their ratio.

@@ -39,13 +39,14 @@ from handtouch.supervisor.diagnose.model import (
     PadDiagnosis,
 )
 from handtouch.supervisor.diagnose.offset_steps import OffsetStepDetector
-from handtouch.supervisor.diagnose.static_load import StaticLoadDetector
+from handtouch.supervisor.diagnose.static_load import StaticLoad, StaticLoadDetector
 from handtouch.wire.faults import FaultKind
 
 BoolArray = NDArray[np.bool_]
 # Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.
-_MIN_CONFIDENCE_CHANGE = 0.3  # that is reported
+_MIN_CONFIDENCE_CHANGE = 0.3  # that is reported,
+_MIN_PROBABILITY_CHANGE = 0.1  # of a load that is probably gum
 _MIN_CONTACT_COUNTS, _MAX_RELEASED_COUNTS = 250.0, 60.0
 """Sums that begin and end a contact: noise of a count is 0.4 % of the former."""
 _MIN_MOVE_FRACTION, _MAX_SMEAR_FRACTION = 0.08, 0.03  # fractions of a side, roughly
@@ -214,7 +215,7 @@ class HandDiagnostics:
             if load.kind is not None:
                 before = self._diagnoses.get((pad, load.kind))
                 names = named_electrodes(self._model, pad, load)
-                if before is None or before.electrodes != names:  # locating a load is expensive
+                if before is None or before.electrodes != names or _is_changed(load, before):
                     before = describe_static_load(self._model, pad, load, is_located=pad not in faulty)
                 active[pad, load.kind] = before
         for pad, detector in self._contact_detectors.items():
@@ -249,7 +250,15 @@ def _is_sliding(excess: FloatArray, at: int, position: FloatArray, weights: Floa
     return any(np.abs(approximate_position(e, weights) - position).max() > _MAX_SMEAR_FRACTION for e in there)
 
 
+def _is_changed(load: StaticLoad, before: PadDiagnosis) -> bool:
+    """Return whether a load is described again; locating it is expensive."""
+    change = abs(load.probability - before.published.confidence)
+    return load.kind == FaultKind.STATIC_LOAD and change > _MIN_PROBABILITY_CHANGE
+
+
 def _differs(before: PadDiagnosis, now: PadDiagnosis) -> bool:
+    if now.kind == FaultKind.STATIC_LOAD:
+        return before is not now
     if now.kind == FaultKind.DEAD_ELECTRODE and before.published.cause != now.published.cause:
         return True  # dead now, or part of the time only
     change = abs(now.published.confidence - before.published.confidence)

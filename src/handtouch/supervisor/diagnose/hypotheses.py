@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.config.tables import SIDE_ELECTRODES
-from handtouch.field.model import FractionModel
+from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface import Surface
 from handtouch.supervisor.diagnose.model import FloatArray
@@ -102,7 +102,7 @@ class HypothesisTables:
 
     def __init__(
         self,
-        network: ElectrodeNetwork,
+        network: ChannelModel,
         surface: Surface,
         parts: Sequence[FractionModel] = (),
         electrodes: tuple[str, ...] = SIDE_ELECTRODES,
@@ -142,7 +142,8 @@ class HypothesisTables:
                 )
                 others.append(merged)
         self._electrode_faults = _FractionTable(np.stack(others), shape)
-        torn = self._torn_pads(network, surface, nominal) if electrodes == SIDE_ELECTRODES else []
+        is_sheet = electrodes == SIDE_ELECTRODES and isinstance(network, ElectrodeNetwork)
+        torn = self._torn_pads(network, surface, nominal) if is_sheet else []
         self._torn = _FractionTable(np.reshape(torn, (len(torn), *nominal.shape)), shape)
         self.hypotheses.append(Hypothesis(FaultKind.UNEXPLAINED, ()))
         self.kinds = np.array([h.kind for h in self.hypotheses])
@@ -151,10 +152,9 @@ class HypothesisTables:
         no_cut = np.zeros((2, *nominal.shape))
         self._tolerances = np.array([*tolerances, *no_cut, *(nominal * channel for channel in np.eye(c))])
 
-    def _torn_pads(
-        self, network: ElectrodeNetwork, surface: Surface, nominal: FloatArray
-    ) -> list[FloatArray]:
+    def _torn_pads(self, network: ChannelModel, surface: Surface, nominal: FloatArray) -> list[FloatArray]:
         """Add the hypotheses of torn corners; return their fractions (P, c)."""
+        assert isinstance(network, ElectrodeNetwork)
         pads = []
         sheet = SheetChanges(network, surface, self._sides)
         cuts = list(itertools.product(CORNERS, _CUT_FRACTIONS, _CUT_FRACTIONS))

@@ -16,10 +16,15 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.core.pad_model import ampere_per_count_of
-from handtouch.field.model import FractionModel
-from handtouch.field.network import ElectrodeNetwork
+from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.surface import Surface
-from handtouch.hand import models_with_other_parts, pad_network, pad_surface
+from handtouch.hand import (
+    channel_gain_std,
+    models_with_other_parts,
+    network_parameters,
+    pad_channels,
+    pad_surface,
+)
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 
@@ -60,8 +65,8 @@ class PadDiagnosis:
 
     @property
     def is_fault(self) -> bool:
-        """Return whether it needs attention; a held object doesn't."""
-        return self.kind != FaultKind.HELD_OBJECT
+        """Return whether it is known to need attention; a held object doesn't, and a load may be one."""
+        return self.kind not in (FaultKind.HELD_OBJECT, FaultKind.STATIC_LOAD)
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class DiagnosisModel:
 
     links: tuple[str, ...]
     electrodes: Sequence[tuple[str, ...]]
-    networks: Sequence[ElectrodeNetwork]
+    networks: Sequence[ChannelModel]
     surfaces: Sequence[Surface]
     sheets: Sequence[config.Sheet]
     parts: Sequence[Callable[[], Sequence[FractionModel]]]
@@ -108,24 +113,23 @@ class DiagnosisModel:
             own = slice(len(pad.electrode_names))
             scale[row, own] = ampere_per_count_of(pad, deployment)
             limits[row, own] = [one.saturation for one in order_by_electrode(node_channels(node), pad)]
-        by_design: dict[Hashable, ElectrodeNetwork] = {}  # pads of one design share one network
+        by_design: dict[Hashable, ChannelModel] = {}  # pads of one design share one network
         networks, designs = [], []
         for pad, node in zip(pads, nodes, strict=True):
-            sheet = deployment.sheets[pad.sheet]
-            parts = pad.surface, pad.arcs_mm, pad.gaps_mm, pad.series_ohm
-            design = (*parts, sheet, node.gain_std, node.series_std)
+            sheet = deployment.sheet_of(pad)
+            design = (*network_parameters(pad), sheet, node.gain_std, node.series_std)
             designs.append(design)
             if design not in by_design:
-                by_design[design] = pad_network(pad, sheet)
+                by_design[design] = pad_channels(pad, sheet, node)
             networks.append(by_design[design])
         return cls(
             links=tuple(pad.link for pad in pads),
             electrodes=[pad.electrode_names for pad in pads],
             networks=networks,
             surfaces=[pad_surface(pad) for pad in pads],
-            sheets=[deployment.sheets[pad.sheet] for pad in pads],
+            sheets=[deployment.sheet_of(pad) for pad in pads],
             parts=[
-                partial(models_with_other_parts, network, pad, node, deployment.sheets[pad.sheet])
+                partial(models_with_other_parts, network, pad, node, deployment.sheet_of(pad))
                 for network, pad, node in zip(networks, pads, nodes, strict=True)
             ],
             drive_v=np.array([node.drive_v for node in nodes]),
@@ -136,8 +140,8 @@ class DiagnosisModel:
             offset_counts=np.zeros(scale.shape),
             gain_covariance=np.stack(
                 [
-                    node.gain_std**2 * np.diag((row > 0).astype(float))
-                    for node, row in zip(nodes, scale, strict=True)
+                    channel_gain_std(pad, node) ** 2 * np.diag((row > 0).astype(float))
+                    for pad, node, row in zip(pads, nodes, scale, strict=True)
                 ]
             ),
         )

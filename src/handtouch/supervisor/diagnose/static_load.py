@@ -38,6 +38,9 @@ _CAUSES = (
     FaultKind.MOISTURE,
     FaultKind.COMMON_DRIFT,
 )
+_MIN_PROBABLE_AGE_S = 60.0
+"""Age of a load that isn't used again from which it is reported if gum is its most probable cause: chosen, as
+objects are seldom held so long without tremor."""
 _MIN_AGE_S = dict(zip(_CAUSES, (8.0, 15.0, 8.0, 6.0, 15.0, 15.0), strict=True))
 """Age at which each cause may be named: chosen, with 15 s where the search of slopes needs 14 s of floors."""
 # The numbers below are degrees of belief, not counted frequencies. They were chosen by what each cause does
@@ -320,10 +323,13 @@ class StaticLoadDetector:
         )
         if share[best] >= known and age_s >= _MIN_AGE_S[cause] and observable:
             load.kind = cause
-        elif load.kind is None and age_s > 300:
-            load.kind = FaultKind.UNEXPLAINED
-        if load.kind in _CAUSES:
-            load.probability = float(share[_CAUSES.index(load.kind)])
+        elif load.kind in (None, FaultKind.STATIC_LOAD):
+            load.kind = FaultKind.UNEXPLAINED if age_s > 300 else None
+            if cause == FaultKind.GUM and age_s > _MIN_PROBABLE_AGE_S:
+                load.kind = FaultKind.STATIC_LOAD
+        named = FaultKind.GUM if load.kind == FaultKind.STATIC_LOAD else load.kind
+        if named in _CAUSES:
+            load.probability = float(share[_CAUSES.index(named)])
 
     def _features(self, pad: int, load: StaticLoad, age_s: float) -> tuple[dict[str, bool | None], float]:
         level = load.level_counts

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from handtouch import wire
 from handtouch.view.message_lines import percept_summary
 
-_KINDS = ("motion", "shape", "friction", "object")
 _ELLIPSOID_CHI2 = 7.815
 """95 % of a normal distribution in three dimensions"""
 _DEFAULT_LABELS = ("sticking", "point")
@@ -86,11 +85,11 @@ class PerceptSummaries:
             del self._pads[key]
             return None
         self._pads[key] = valid
-        estimates = [valid[kind] for kind in _KINDS if kind in valid]
+        estimates = [valid[kind] for kind in wire.PERCEPT_KINDS if kind in valid]
         poses = [pose for held in estimates for pose in held.poses]
         return ({"poses": poses} if poses else {}) | {
             "labels": [held.label for held in estimates if held.label],
             "lines": [held.text for held in estimates if held.text],
-            "requests": [held.text for kind, held in valid.items() if kind not in _KINDS],
+            "requests": [held.text for kind, held in valid.items() if kind not in wire.PERCEPT_KINDS],
             "missing": [held.missing for held in estimates if held.missing],
         }

@@ -1,0 +1,101 @@
+"""Pads of two films: x electrodes on the upper one, y electrodes on the lower one, a pressed layer between.
+
+Public name: `TwoLayers`. Geometry of four-wire touch film. With two insulated sides a film's potential is
+linear between its electrodes, and so, by reciprocity, is the share that each collects of the current at a
+place: the centroid of all current follows exactly, of any contacts at any pressures.
+
+The layer carries its current between the films, so that sheet resistances add, and the logarithms of both
+films' spreading radii; the law of a contact on one film holds with these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from handtouch.field.channel_map import VARIATIONS, ChannelMap
+from handtouch.field.surface_base import Surface
+
+FloatArray = npt.NDArray[np.float64]
+_IMAGES = 2  # on each side, and as many more per a / b; they fall by exp(-2 pi b / a) from one to the next
+_LEAST_DISTANCE = 1e-9  # of an image, in sides: a contact on an insulated edge is as good as two
+
+
+class TwoLayers(ChannelMap):
+    """Channels x0, xa of the upper film, y0, yb of the lower one; signals are shares of a contact's
+    current.
+
+    ohm_per_square: of each film. lead_ohm: of the four electrodes, to their amplifiers. lead_std_ohm: their
+    standard deviation; unevenness_std: that of the logarithm of a film's resistance from one end to the
+    middle.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        ohm_per_square: float,
+        contact_radius_m: float,
+        lead_ohm: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+        *,
+        lead_std_ohm: float = 0.0,
+        unevenness_std: float = 0.0,
+    ) -> None:
+        super().__init__(surface, 4, contact_radius_m)
+        self.sheet_ohm_per_square = 2 * ohm_per_square
+        self._lead_std_ohm, self._unevenness_std = lead_std_ohm, unevenness_std
+        leads = np.reshape(lead_ohm, (2, 2))
+        film = ohm_per_square * np.array([self.a / self.b, self.b / self.a])
+        whole = film + leads.sum(axis=1)
+        self._begin, self._growth, self._per_ohm = leads[:, 0] / whole, film / whole, 1 / whole
+
+    def respond(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        return _pairs(*self._shares(x, y))
+
+    def variation_slopes(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return changes by each lead, and by films whose resistance varies along the current."""
+        x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        shares, none = self._shares(x, y), np.zeros_like(x)
+        found = np.zeros((VARIATIONS, self.channels, *x.shape))
+        for number in range(4):
+            film, end = divmod(number, 2)
+            change = self._lead_std_ohm * self._per_ohm[film] * (1 - end - shares[film])
+            found[number] = _pairs(*(change if k == film else none for k in range(2)), change=True)
+        bends = [np.sin(np.pi * at / side) / np.pi for at, side in ((x, self.a), (y, self.b))]
+        found[4] = self._unevenness_std * _pairs(*bends, change=True)
+        return found
+
+    def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
+        """Return the geometric mean of both films' radii."""
+        x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        upper, lower = _strip_radius(x, y, self.a, self.b), _strip_radius(y, x, self.b, self.a)
+        return np.asarray(np.sqrt(upper * lower))
+
+    def _shares(self, x: FloatArray, y: FloatArray) -> list[FloatArray]:
+        """Return the shares of the electrodes xa and yb."""
+        along = x / self.a, y / self.b
+        return [self._begin[k] + self._growth[k] * along[k] for k in range(2)]
+
+
+def _pairs(of_xa: FloatArray, of_yb: FloatArray, *, change: bool = False) -> FloatArray:
+    """Return the signals (4, ...) of which those of both electrodes of a film sum to 1, or changes, to 0."""
+    whole = 0.0 if change else 1.0
+    return np.stack([whole - of_xa, of_xa, whole - of_yb, of_yb])
+
+
+def _strip_radius(x: FloatArray, y: FloatArray, a: float, b: float) -> FloatArray:
+    """Return the spreading radius of a film with electrodes at x = 0 and a, insulated at y = 0 and b.
+
+    Of an endless strip it is that of a conformal map; insulated sides are mirrors.
+    """
+    twice = np.cos(2 * np.pi * x / a)
+    log_radius = np.log(2 * a / np.pi * np.sin(np.pi * x / a))
+    count = math.ceil(_IMAGES * (1 + a / b))
+    mirrored = [2 * (y + b * number) for number in range(-count, count + 1)]
+    repeated = [2 * b * number + 0 * y for number in range(1, count + 1)] * 2
+    for away in mirrored + repeated:
+        reach = np.cosh(np.pi * np.maximum(np.abs(away), _LEAST_DISTANCE * b) / a)
+        log_radius = log_radius + 0.5 * np.log((reach - twice) / (reach - 1))
+    return np.asarray(np.exp(log_radius))

@@ -1,0 +1,114 @@
+"""Pads of two films: the map against films solved by finite volumes, and contacts by the stages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from handtouch.config import Deployment, load, shipped
+from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.memory import view_memory
+from handtouch.core.pad_model import PadModel
+from handtouch.field.channel_map import ChannelMap
+from handtouch.field.two_layers import TwoLayers
+from handtouch.simulate.contact_patch import discs
+from handtouch.simulate.scenario import Scenario
+from handtouch.simulate.touch import ScenarioTouch
+from handtouch.simulate.two_layers import TwoLayerCircuit
+from handtouch.simulate.virtual_hand import VirtualHand
+from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
+
+FloatArray = NDArray[np.float64]
+TOUCH = (ScenarioTouch(link="tip", from_s=0.0, duration_s=1.0, path=((0.5, 0.5),), force_n=(1.0,)),)
+
+
+@pytest.fixture(scope="module")
+def deployment() -> Deployment:
+    return load(shipped.path("two_layers.toml"))
+
+
+@pytest.fixture(scope="module")
+def model(deployment: Deployment) -> PadModel:
+    return PadModel(deployment)
+
+
+def circuit(deployment: Deployment, row: int, world: DrawnWorld | None = None) -> TwoLayerCircuit:
+    drawn = world or WORLDS["ideal"].draw(Family.TUNING.seed(1))
+    found = VirtualHand(deployment, Scenario(touch=TOUCH), drawn).virtual_pads[row].circuit
+    assert isinstance(found, TwoLayerCircuit)
+    return found
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_films_solved_by_finite_volumes_have_the_map_and_the_radii(
+    deployment: Deployment, model: PadModel, row: int
+) -> None:
+    solved, network = circuit(deployment, row), model.networks[row]
+    s, t = np.array([[0.5, 0.5], [0.2, 0.7], [0.9, 0.1]]).T
+    x, y = s * network.a, t * network.b
+    shares = np.stack([table.ev(s, t) for table in solved.tables])
+    assert shares == pytest.approx(network.fractions(x, y), abs=1e-6)
+    assert isinstance(network, TwoLayers)
+    scale = network.surface.scale(x, y)
+    assert np.exp(solved.log_radius.ev(s, t)) == pytest.approx(
+        network.spreading_radius(x, y) * scale, rel=5e-3
+    )
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_contacts_are_found_where_they_are_solved(deployment: Deployment, model: PadModel, row: int) -> None:
+    solved, network = circuit(deployment, row), model.networks[row]
+    for s, t, force_n in ((0.5, 0.5, 1.0), (0.25, 0.7, 0.3), (0.8, 0.35, 4.0)):
+        signals = solved.signals(np.array([[s], [t]]), discs(np.array([2.5e-3])), np.array([force_n]))[0]
+        assert signals[:2].sum() == pytest.approx(signals[2:].sum())
+        currents, values = np.zeros((model.size, 4)), np.full((model.size, VALUE_COUNT), np.nan)
+        currents[row] = signals
+        solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+        solver.solve_contacts(view_memory(np.array([row])))
+        x, y = values[row, VALUE_SLICES["xy"]]
+        assert (x / network.a, y / network.b) == pytest.approx((s, t), abs=4e-3)
+        assert values[row, VALUE_SLICES["force_n"]][0] == pytest.approx(force_n, rel=0.06)
+
+
+def test_two_contacts_have_the_centroid_of_their_currents(model: PadModel) -> None:
+    network = model.networks[1]
+    one, other = ((0.2, 0.3), 1.0), ((0.8, 0.9), 2.0)
+    currents = np.zeros((model.size, 4))
+    for (s, t), current in (one, other):
+        currents[1] += 5e-5 * current * network.fractions(s * network.a, t * network.b)
+    values = np.full((model.size, VALUE_COUNT), np.nan)
+    solver = make_solver(model, currents, np.zeros(model.size), np.zeros(model.size, np.bool_), values)
+    solver.solve_contacts(view_memory(np.array([1])))
+    x, y = values[1, VALUE_SLICES["xy"]]
+    assert (x / network.a, y / network.b) == pytest.approx((0.6, 0.7), abs=2e-3)
+
+
+def test_leads_move_contacts_towards_the_middle_as_in_the_solved_films(deployment: Deployment) -> None:
+    pad = deployment.pads[1].pad
+    leads = pad.response.model_copy(update={"lead_ohm": (30.0, 10.0, 0.0, 20.0)})  # type: ignore[union-attr]
+    (hand,) = deployment.hands
+    pads = (hand.pads[0], pad.model_copy(update={"response": leads}))
+    changed = deployment.model_copy(update={"hands": (hand.model_copy(update={"pads": pads}),)})
+    network = leads.build(pad.surface.build())
+    assert isinstance(network, TwoLayers)
+    tables = circuit(changed, 1).tables
+    for s, t in ((0.1, 0.9), (0.5, 0.5)):
+        solved = np.array([table.ev(np.array(s), np.array(t)) for table in tables])
+        assert network.fractions(s * network.a, t * network.b) == pytest.approx(solved, abs=1e-6)
+    assert network.fractions(0.0, 0.0)[1] > 0.02
+
+
+def test_gaps_and_uneven_films_of_a_careful_builder_are_in_the_tolerances(deployment: Deployment) -> None:
+    scores = []
+    for seed in range(4):
+        drawn = WORLDS["default"].draw(Family.TUNING.seed(seed))
+        stated = drawn.describe(deployment)
+        network = PadModel(stated).networks[1]
+        assert isinstance(network, ChannelMap)
+        s, t = (at.ravel() for at in np.meshgrid(np.linspace(0.15, 0.85, 5), np.linspace(0.2, 0.8, 5)))
+        shares = np.stack([table.ev(s, t) for table in circuit(stated, 1, drawn).tables])
+        x, y = s * network.a, t * network.b
+        spread = np.sqrt(np.square(network.variation_slopes(x, y)).sum(axis=0))
+        scores.append(np.square((shares - network.fractions(x, y)) / spread)[[1, 3]].mean())
+    assert np.mean(scores) < 1.5
