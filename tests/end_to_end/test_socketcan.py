@@ -98,7 +98,7 @@ def test_bus_states_and_lost_nodes_are_logged_with_the_bus_as_cause(vcan_rig: An
     rig.simulate()
     rig.start("run")
     rig.wait_operational()
-    _wait_for_line(rig, [], "node 0x")
+    _wait_for_line(rig, [], "settling -> operational")
     for frame, line in (
         ("20000004#0004000000000000", "WARNING handtouch.bus: bus can0: active -> warning: error-warning"),
         ("20000004#0020000000000000", "-> passive: error-passive"),
