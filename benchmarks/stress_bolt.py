@@ -165,7 +165,7 @@ def state(cell: BoltWorkcell, steps: list[Step]) -> str:
 
 def digest() -> str:
     """Return a digest of the sources that the outcome depends on most."""
-    files = [ROOT / "examples" / "start_bolt.py"]
+    files = [ROOT / "examples" / name for name in ("bolt_pose.py", "start_bolt.py")]
     files += sorted((ROOT / "src/handtouch/simulate/tactile").glob("bolt_*.py"))
     own = [inspect.getsource(part).encode() for part in (LimitedCell, limited, episode)]
     return hashlib.sha256(b"".join([*(file.read_bytes() for file in files), *own])).hexdigest()[:12]
@@ -237,9 +237,8 @@ def statements(found: dict[Case, dict[int, Row]]) -> list[str]:
         for other, name in (("truth", "with the true pose"), ("binary", "with binary contact")):
             if others := found.get(case._replace(variant=other)):
                 shared = len(set(rows) & set(others))
-                text += (
-                    f"; {name} {times(others)}, {minus(others, rows)} points for the {shared} seeds in common"
-                )
+                seeds = "one seed" if shared == 1 else f"{shared} seeds"
+                text += f"; {name} {times(others)}, {minus(others, rows)} points for the {seeds} in common"
         said.append(text + ".")
     served, same = found.get(Case("default", 1.0, SERVED)), found.get(Case("default", 1.0, "handtouch"), {})
     if served and (both := sorted(set(served) & set(same))):
@@ -264,7 +263,8 @@ def times(rows: dict[int, Row]) -> str:
     """Return how often the bolt was inserted."""
     share = Share.of_mask(np.array(list(is_in(rows).values())))
     low, high = share.interval
-    return f"{share.count} of {share.total} times ({100 * low:.0f} to {100 * high:.0f} %)"
+    tries = "once" if share.count == share.total == 1 else f"{share.count} of {share.total} times"
+    return f"{tries} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def say(lines: list[str]) -> None:

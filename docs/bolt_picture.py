@@ -8,6 +8,7 @@ of both ends.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,16 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.optimize import least_squares
 
 from handtouch.simulate.tactile.bolt_scene import HOLE_M, BoltStart
 from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose, Sensed
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "examples"))
+import bolt_pose  # noqa: E402
 import start_bolt  # noqa: E402
-from start_bolt import HALF_M, BoltStarter, Contact, Step, compose  # noqa: E402
+from bolt_pose import HALF_M, Contact, InGrip, OnTable, compose  # noqa: E402
+from start_bolt import BoltStarter, Step  # noqa: E402
 
 FloatArray = NDArray[np.float64]
 WIDTH, HEIGHT, EVERY = 480, 360, 20
@@ -48,13 +50,10 @@ _STILLS = {
 class Estimate:
     """Both ends of the bolt (2, 3) in a frame, and their covariances (2, 3, 3), as a fit leaves them."""
 
-    def __init__(self, fit: Any, pose_of: Any) -> None:
-        self.points_m = _ends(pose_of(fit.x))
+    def __init__(self, x: FloatArray, covariance: FloatArray, pose_of: Callable[[FloatArray], Pose]) -> None:
+        self.points_m = _ends(pose_of(x))
         step = 1e-4
-        slopes = np.stack(
-            [(_ends(pose_of(fit.x + step * e)) - self.points_m) / step for e in np.eye(len(fit.x))]
-        )
-        covariance = np.linalg.pinv(fit.jac.T @ fit.jac)
+        slopes = np.stack([(_ends(pose_of(x + step * e)) - self.points_m) / step for e in np.eye(len(x))])
         self.covariances_m2 = np.einsum("aej,ab,bek->ejk", slopes, covariance, slopes)
 
 
@@ -69,26 +68,20 @@ class Watched:
         self.contacts: list[Contact] = []
         self.on_table: Estimate | None = None
         self.in_grip: Estimate | None = None
-        self._pose_on_table, self._pose_in_grip = start_bolt.pose_on_table, start_bolt.pose_in_grip
-        start_bolt.pose_on_table, start_bolt.pose_in_grip = self.pose_on_table, self.pose_in_grip
+        start_bolt.poses_on_table, start_bolt.pose_in_grip = self.poses_on_table, self.pose_in_grip
 
-    def pose_on_table(self, contacts: list[Contact], spheres: FloatArray) -> tuple[Pose, float, float]:
+    def poses_on_table(self, contacts: list[Contact], spheres: FloatArray) -> list[OnTable]:
         """Do as the program's."""
-        found = self._pose_on_table(contacts, spheres)
-        (x, y, _), axis = found[0][0], found[0][1][:, 2]
-        start = np.array([x, y, np.arctan2(axis[1], axis[0])])
-        fit = least_squares(
-            start_bolt._on_table, start, args=(contacts, spheres), x_scale=[1e-3, 1e-3, 0.1], max_nfev=1
-        )
+        found = bolt_pose.poses_on_table(contacts, spheres)
         self.contacts, self.in_grip = list(contacts), None
-        self.on_table = Estimate(fit, lambda x: start_bolt.lying(*x))
+        self.on_table = Estimate(found[0].parameters, found[0].covariance, lambda x: bolt_pose.lying(*x))
         return found
 
-    def pose_in_grip(self, expected: Pose, contacts: list[Contact]) -> tuple[Pose, float]:
+    def pose_in_grip(self, expected: Pose, contacts: list[Contact]) -> InGrip:
         """Do as the program's."""
-        fit = least_squares(start_bolt._in_grip, np.zeros(6), args=(expected, contacts))
-        self.contacts, self.in_grip = [], Estimate(fit, lambda x: start_bolt._shifted(x, expected))
-        return self._pose_in_grip(expected, contacts)
+        found = bolt_pose.pose_in_grip(expected, contacts)
+        self.contacts, self.in_grip = [], Estimate(found.change, found.covariance, found.at)
+        return found
 
 
 class FilmedCell(BoltWorkcell):

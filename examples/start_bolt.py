@@ -15,29 +15,34 @@ Needs the extra `gym`. Public names: `BoltStarter`, `Step`.
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from bolt_pose import (
+    HALF_M,
+    SHANK_M,
+    UP,
+    Contact,
+    OnTable,
+    compose,
+    inverse,
+    lying,
+    pose_in_grip,
+    poses_on_table,
+    relative,
+    touched_m,
+)
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from handtouch.config.objects import BoltShape, ObjectTable
-from handtouch.percept.object_shapes import build_shape
 from handtouch.simulate.tactile.bolt_scene import HOLE_M, BoltStart
 from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose
 
 FloatArray = NDArray[np.float64]
-
-_SHAPE = BoltShape(kind="bolt", diameter_mm=10, length_mm=40, head_diameter_mm=17, head_length_mm=6.4)
-BOLT = build_shape(ObjectTable(shape=_SHAPE))
-HALF_M = float(BOLT.half_m[2])
-SHANK_M, HEAD_M, HEAD_LENGTH_M = 5e-3, 8.5e-3, 6.4e-3
-"""Radii of shank and head, as they touch the table: a hexagon is between 8 and 9.2 mm"""
-AREA_M = 0.02
 
 # The grip, in the palm: origin, and axes from the thumb to the fingers, along the bolt, and of the approach.
 GRIP_M = np.array([0.130, -0.023, 0.086])
@@ -75,18 +80,21 @@ FLAT_SPHERES = {
     "distal": [(0.0, 0.0095), (0.008, 0.0095), (0.0155, 0.01)],
 }
 """Spheres in the links of a finger: distance along x and radius [m]"""
-_ON_TABLE_M, _FORWARD_M = 6e-3, 0.012
+_ON_TABLE_M = 6e-3
+_BEGIN_M, _END_M = 0.028, 0.005
+"""Heights between which flat fingers are lowered until they touch"""
+_ALONG_M, _TURNS_RAD = (-0.012, 0.0, 0.012), np.radians([0, 50, 90, 130, 180, -130, -90, -50])
+"""Touches to choose from, by places along a possible bolt and directions of the fingers to it"""
+_TOUCH_STD_M = 2e-3
+"""Of a touched point as it is predicted"""
 MIN_WEIGHT, MAX_STD_RAD, MAX_PRESSES = 0.95, np.radians(3.0), 10
 
 FORCE_N, MIN_FORCE_N = {"thumb": 4.0, "index": 2.4, "middle": 1.6}, 0.4
 _PUSHED_M, _JAMMED_M = 0.5e-3, 1.5e-3
 """Mean displacement of the fingertips by the rim, while the tip searches and at most: 0.5 N and 1.5 N"""
 _SPIRAL_PITCH_M, _SPIRAL_M = 0.5e-3, 4e-3
-_GRIPPED_STD_M, _GRIPPED_STD_RAD = 2.5e-3, np.array([0.04, 0.1, 0.12])
-"""Of the bolt in the grip, as it was found on the table: closing fingers turn it about the approach most"""
 INSERT_M = 9e-3
 """Depth to reach, by the estimate of the bolt along the hand, which may be wrong by some millimetres"""
-UP = np.array([0.0, 0.0, 1.0])
 
 
 class Step(Enum):
@@ -98,24 +106,6 @@ class Step(Enum):
     INSERT = "insert"
     DONE = "done"
     FAILED = "failed"
-
-
-class Contact(NamedTuple):
-    """A contact in the world, or in another frame."""
-
-    point_m: FloatArray
-    normal: FloatArray
-    """from the pad into the object"""
-    std_m: float
-    """along the normal"""
-    std_rad: float
-    """of the normal: pads are round, so it is as uncertain as the place on the pad"""
-    force_n: float
-
-    def seen_from(self, pose: Pose) -> Contact:
-        """Return it in the frame that has a pose."""
-        position, rotation = pose
-        return self._replace(point_m=(self.point_m - position) @ rotation, normal=self.normal @ rotation)
 
 
 class Arm:
@@ -234,12 +224,11 @@ class BoltStarter:
             free.append(spheres)
             yaw = np.radians(120.0 * (number + 1))
             if len(found) > 2:
-                self._table, sure, std_rad = pose_on_table(found, np.concatenate(free))
+                poses = poses_on_table(found, np.concatenate(free))
+                self._table, sure, std_rad = poses[0].pose, poses[0].weight, poses[0].direction_std_rad
                 if sure > MIN_WEIGHT and std_rad < MAX_STD_RAD:
                     break
-                heading = self._table[1][:2, 2]  # the next touch is that of the likeliest tip
-                place = self._table[0][:2] + _FORWARD_M * heading
-                yaw = np.arctan2(heading[1], heading[0]) + np.radians((0, 50, -50)[number % 3])
+                place, yaw = self._most_telling(poses)
             elif found:
                 place = found[-1].point_m[:2]
         if sure < MIN_WEIGHT:
@@ -282,10 +271,11 @@ class BoltStarter:
             self._held = relative(grip, self._truth())
             return Step.ORIENT
         contacts = [each.seen_from(grip) for each in self._fingertips().values()]
-        self._held, sure = pose_in_grip(relative(self._grasped_at, self._table), contacts)
+        found = pose_in_grip(relative(self._grasped_at, self._table), contacts)
+        self._held = found.pose
         tilt = np.degrees(np.arcsin(np.clip(self._held[1][[0, 2], 2], -1, 1)))
         told = f"in the grip at {1e3 * self._held[0].round(4)} mm, tilted by {tilt.round(1)} degrees"
-        self._log(f"{told}; weight of this end {sure:.2f}")
+        self._log(f"{told}; weight of this end {found.weight:.2f}")
         return Step.ORIENT
 
     def _orient(self) -> Step:
@@ -394,9 +384,9 @@ class BoltStarter:
         """Lower flat fingers until they touch the bolt; return contacts, and spheres where it isn't."""
         flat = self._arm.posture(FLAT_RAD)
         self._go(self._flat_on(middle, 0.05, yaw), flat, 0.8)
-        self._go(self._flat_on(middle, 0.028, yaw), flat, 0.2)
+        self._go(self._flat_on(middle, _BEGIN_M, yaw), flat, 0.2)
         last: dict[str, list[Contact]] = {}
-        if self._go(self._flat_on(middle, 0.005, yaw), flat, 1.5, until=lambda: bool(self._on_bolt())):
+        if self._go(self._flat_on(middle, _END_M, yaw), flat, 1.5, until=lambda: bool(self._on_bolt())):
             for _ in range(5):
                 self._move(self._flange, flat)
                 for link, each in self._on_bolt().items():
@@ -408,12 +398,41 @@ class BoltStarter:
             self._log(f"touched at {1e3 * mean_m.round(4)} mm")
         return [each._replace(point_m=mean_m) for each, mean_m in means], spheres
 
+    def _most_telling(self, poses: list[OnTable]) -> tuple[FloatArray, float]:
+        """Return place and yaw of the touch that is expected to tell possible poses of the bolt apart best.
+
+        For each pose that may be the true one: the weights of all after a touch where that pose predicts it;
+        what counts is how well the bolt's direction is known by them: the length of its mean vector.
+        """
+        drawn = [each for pose in poses for each in pose.spread()]
+        weights = np.array([weight for _, weight in drawn])
+        headings = np.exp(1j * np.array([parameters[2] for parameters, _ in drawn]))
+        self._arm.set(self._arm.posture(FLAT_RAD))
+        flat = self._flat_spheres(self._flat_on(np.zeros(2), 0.0, 0.0))
+        best, chosen = -1.0, (np.zeros(2), 0.0)
+        for (along_m, turn), pose in itertools.product(itertools.product(_ALONG_M, _TURNS_RAD), poses):
+            x, y, toward = pose.parameters
+            place = np.array([x + along_m * np.cos(toward), y + along_m * np.sin(toward)])
+            spheres = flat.copy()
+            spheres[:, :3] = flat[:, :3] @ Rotation.from_euler("z", toward + turn).as_matrix().T
+            spheres[:, :2] += place
+            touched = np.array([touched_m(lying(*each), spheres, _END_M) for each, _ in drawn])
+            apart = np.square(touched[:, None] - touched).sum(axis=2) / (2 * _TOUCH_STD_M**2)
+            after = weights[:, None] * np.exp(-apart / 2)
+            known = float(weights @ np.abs((after / after.sum(axis=0)).T @ headings))
+            if known > best:
+                best, chosen = known, (place, toward + turn)
+        return chosen
+
     def _spheres(self) -> FloatArray:
         """Return spheres in flat fingers (n, 4), centre in the world and radius."""
         self._arm.set(self._sensed.joint_rad)
+        return self._flat_spheres(self._flange)
+
+    def _flat_spheres(self, flange: Pose) -> FloatArray:
         found = []
         for link in FLAT_LINKS:
-            position, rotation = compose(self._flange, self._arm.link("base", link))
+            position, rotation = compose(flange, self._arm.link("base", link))
             for along_m, radius_m in FLAT_SPHERES[link.partition("_")[2]]:
                 found.append([*(position + along_m * rotation[:, 0]), radius_m])
         return np.array(found)
@@ -466,107 +485,6 @@ class BoltStarter:
         turned = turn.as_matrix() @ now
         tip = position + HALF_M * rotation[:, 2]
         return self._gripping((HOLE_M + np.array([0.0, beyond_m, 0.0]) - turned @ tip, turned))
-
-
-# Poses of the bolt -----------------------------------------------------------------------------------------
-
-
-def contact_residuals(pose: Pose, contacts: list[Contact], std_m: float, std_rad: float) -> FloatArray:
-    """Return how contacts (c,) deviate from a bolt's surface, in standard deviations (4 c,).
-
-    Normals are compared 3 mm outside, where the gradient at an edge is any normal that a pad there may have.
-    """
-    position, rotation = pose
-    points = (np.array([each.point_m for each in contacts]) - position) @ rotation
-    normals = np.array([each.normal for each in contacts]) @ rotation
-    distance = BOLT.distance(points)
-    _, outward = BOLT.distance_and_normal(points - 3e-3 * normals)
-    spread = np.hypot([each.std_m for each in contacts], std_m)
-    turned = np.hypot([each.std_rad for each in contacts], std_rad)
-    return np.concatenate([distance / spread, ((outward + normals) / turned[:, None]).ravel()])
-
-
-def pose_on_table(contacts: list[Contact], spheres: FloatArray) -> tuple[Pose, float, float]:
-    """Return the likeliest pose of a bolt on the table, outside of spheres (n, 4).
-
-    Then the weight of this end against the other, and the standard deviation of its direction.
-    """
-    middle = np.mean([each.point_m[:2] for each in contacts], axis=0)
-    reach = np.arange(-0.024, 0.0241, 0.004)
-    best: list[tuple[float, FloatArray]] = []
-    for yaw in np.radians(np.arange(0, 360, 10)):
-        along = np.array([np.cos(yaw), np.sin(yaw)])
-        across = np.array([-along[1], along[0]])
-        starts = [(middle + a * along + b * across, yaw) for a in reach for b in (-0.005, 0.0, 0.005)]
-        costs = [np.square(_on_table(np.array([*at, yaw]), contacts, spheres)).sum() for at, yaw in starts]
-        k = int(np.argmin(costs))
-        best.append((float(costs[k]), np.array([*starts[k][0], yaw])))
-    best.sort(key=lambda each: each[0])
-    fits = [
-        least_squares(_on_table, start, args=(contacts, spheres), x_scale=[1e-3, 1e-3, 0.1])
-        for _, start in best[:8]
-    ]
-    fits.sort(key=lambda fit: fit.cost)
-    x, y, yaw = fits[0].x
-    turned = [fit.cost for fit in fits if np.cos(fit.x[2] - yaw) < 0]
-    covariance = np.linalg.pinv(np.asarray(fits[0].jac).T @ np.asarray(fits[0].jac))
-    weight = weight_of(fits[0].cost, min(turned, default=np.inf))
-    return lying(x, y, yaw), weight, float(np.sqrt(covariance[2, 2]))
-
-
-def _on_table(parameters: FloatArray, contacts: list[Contact], spheres: FloatArray) -> FloatArray:
-    position, rotation = pose = lying(*parameters)
-    apart_m = BOLT.distance((spheres[:, :3] - position) @ rotation) - spheres[:, 3]
-    apart, beyond = (apart_m + 0.7e-3) / 1e-3, (np.abs(parameters[:2]) - AREA_M) / 5e-3
-    touched = contact_residuals(pose, contacts, 0.7e-3, 0.2)
-    return np.concatenate([touched, np.minimum(apart, 0.0), np.maximum(beyond, 0.0)])
-
-
-def lying(x: float, y: float, yaw: float) -> Pose:
-    """Return the pose of a bolt on the table, on its head's edge and its tip."""
-    slope = (HEAD_M - 0.5e-3 - SHANK_M) / (2 * HALF_M - HEAD_LENGTH_M)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], UP])
-    upright = np.array([[0.0, -slope, 1.0], [-np.hypot(1.0, slope), 0.0, 0.0], [0.0, -1.0, -slope]])
-    place = np.array([x, y, SHANK_M + slope * HALF_M])
-    return place, turn @ upright / np.hypot(1.0, slope)
-
-
-def pose_in_grip(expected: Pose, contacts: list[Contact]) -> tuple[Pose, float]:
-    """Return the bolt's pose by contacts, near the expected, and the weight of this end against the other."""
-    turned = expected[0], expected[1] @ np.diag([1.0, -1.0, -1.0])
-    fits = [least_squares(_in_grip, np.zeros(6), args=(pose, contacts)) for pose in (expected, turned)]
-    return _shifted(fits[0].x, expected), weight_of(fits[0].cost, fits[1].cost)
-
-
-def _in_grip(change: FloatArray, expected: Pose, contacts: list[Contact]) -> FloatArray:
-    pose = _shifted(change, expected)
-    return np.concatenate([contact_residuals(pose, contacts, 0.4e-3, 0.2), change])
-
-
-def _shifted(change: FloatArray, pose: Pose) -> Pose:
-    """Return a pose after a change (6,), in standard deviations of what is expected."""
-    turn = Rotation.from_rotvec(_GRIPPED_STD_RAD * change[3:]).as_matrix()
-    return pose[0] + _GRIPPED_STD_M * change[:3], turn @ pose[1]
-
-
-def weight_of(cost: float, other: float) -> float:
-    """Return the weight of a hypothesis against another, by half of their squared residuals."""
-    return float(1 / (1 + np.exp(np.clip(cost - other, -50, 50))))
-
-
-def compose(first: Pose, second: Pose) -> Pose:
-    """Return the pose of `second`, which is in the frame of `first`."""
-    return first[0] + first[1] @ second[0], first[1] @ second[1]
-
-
-def inverse(pose: Pose) -> Pose:
-    """Return the inverse of a pose."""
-    return -pose[1].T @ pose[0], pose[1].T
-
-
-def relative(frame: Pose, pose: Pose) -> Pose:
-    """Return a pose in a frame."""
-    return compose(inverse(frame), pose)
 
 
 def _orthonormal(across: FloatArray, approach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
