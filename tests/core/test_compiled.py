@@ -45,11 +45,12 @@ COUNTS = {
     "detect": 200,
     "frames": 600,
     "shear": 400,
-    "pairs": 50,
-    "evidence": 600,
+    "pairs": 20,
+    "evidence": 200,
     "simulator": 60,
 }
-"""Contacts, ticks or samples by program; a pair of contacts takes two seconds of the interpreter."""
+"""Contacts, ticks or samples by program; a pair of contacts takes two seconds of the interpreter, of `pairs`
+there is one."""
 
 
 @pytest.fixture(scope="module")

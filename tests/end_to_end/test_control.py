@@ -7,7 +7,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from handtouch import wire
 from handtouch.cli import main
 from handtouch.client import request
 from handtouch.config import load
+from tests.starter import Starter
+
+from .conftest import own_rig
 
 LONGEST_S = 60.0
 PRESS = [1311, 1021, 415, 253]  # as of a point near the middle of palm_heel
@@ -97,9 +100,23 @@ class Served:
         self.rig.config.write_text(change(text))
 
 
+@pytest.fixture(scope="module")
+def shared(
+    tmp_path_factory: pytest.TempPathFactory, network: list[str], starter: Starter
+) -> Iterator[Served]:
+    with own_rig(tmp_path_factory.mktemp("controlled"), network, starter) as rig:
+        yield Served(rig)
+
+
 @pytest.fixture
-def served(rig: Any) -> Served:
-    return Served(rig)
+def served(shared: Served) -> Iterator[Served]:
+    """The daemon of all tests here, untouched and as configured; only gains that were set stay."""
+    text = shared.rig.config.read_text()
+    yield shared
+    shared.load({})
+    shared.rig.config.write_text(text)
+    shared.ask("reload")
+    shared.until_touched()
 
 
 def test_tare_sets_a_baseline_and_refuses_a_loaded_pad(served: Served) -> None:
