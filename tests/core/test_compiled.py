@@ -45,12 +45,12 @@ COUNTS = {
     "detect": 200,
     "frames": 600,
     "shear": 400,
-    "pairs": 20,
-    "evidence": 200,
+    "pairs": 40,
+    "evidence": 450,
     "simulator": 60,
 }
-"""Contacts, ticks or samples by program; a pair of contacts takes two seconds of the interpreter, of `pairs`
-there is one."""
+"""Contacts, ticks or samples by program; a pair of contacts takes two seconds of the interpreter, of
+which `pairs` takes a twentieth."""
 
 
 @pytest.fixture(scope="module")
