@@ -132,19 +132,17 @@ def network() -> Iterator[list[str]]:
 
 
 @pytest.fixture(scope="session")
-def starter(network: list[str]) -> Iterator[Starter]:
-    """Starts processes in the tests' network."""
-    made = Starter(network)
+def host_starter() -> Iterator[Starter]:
+    """Starts processes in the network of the tests themselves, where SocketCAN is."""
+    made = Starter()
     yield made
     made.close()
 
 
 @pytest.fixture(scope="session")
-def host_starter() -> Iterator[Starter]:
-    """Starts processes in the network of the tests themselves, where SocketCAN is."""
-    made = Starter([])
-    yield made
-    made.close()
+def starter(host_starter: Starter, network: list[str]) -> Starter:
+    """Starts processes in the tests' network."""
+    return host_starter.inside(network)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ Public names: `Starter`, `Started`, `STACKS_SIGNAL`; where processes meet: `own_
 from __future__ import annotations
 
 import contextlib
+import copy
+import ctypes
 import faulthandler
 import json
 import os
@@ -94,23 +96,32 @@ class Started:
 
 
 class Starter:
-    """The process that gets forked, behind a `prefix` such as nsenter's; to be closed."""
+    """The process that gets forked; to be closed."""
 
-    def __init__(self, prefix: list[str]) -> None:
+    def __init__(self) -> None:
+        self._namespaces: list[str] = []
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _REQUEST_BYTES)
         with theirs:
             self._process = subprocess.Popen(
-                [*prefix, sys.executable, __file__, str(theirs.fileno())],
+                [sys.executable, __file__, str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
             )
 
+    def inside(self, prefix: list[str]) -> Starter:
+        """A starter of processes in those namespaces that nsenter, with this prefix, would enter."""
+        made, target = copy.copy(self), prefix[prefix.index("--target") + 1]
+        made._namespaces = [f"/proc/{target}/ns/{kind}" for kind in ("user", "net") if f"--{kind}" in prefix]
+        return made
+
     def start(self, arguments: list[str], output: IO[str], **environment: str) -> Started:
         """`handtouch ARGUMENTS`, printing to a file; `environment` adds to this process's."""
         ours, theirs = os.pipe()
-        request = json.dumps([arguments, os.getcwd(), {**os.environ, **environment}]).encode()
+        request = json.dumps(
+            [arguments, os.getcwd(), {**os.environ, **environment}, self._namespaces]
+        ).encode()
         socket.send_fds(self._socket, [request], [output.fileno(), theirs])
         os.close(theirs)
         pid = self._socket.recv(16)
@@ -151,10 +162,15 @@ def _serve(requests: socket.socket) -> None:
 
 
 def _become(asked: Any, output: int) -> None:
-    arguments, folder, environment = asked
+    arguments, folder, environment, namespaces = asked
     os.dup2(output, 1)
     os.dup2(output, 2)
     os.close(output)
+    libc = ctypes.CDLL(None, use_errno=True)
+    for path in namespaces:
+        with open(path) as namespace:
+            if libc.setns(namespace.fileno(), 0) != 0:
+                raise OSError(ctypes.get_errno(), "setns", path)
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)

@@ -215,12 +215,14 @@ def test_two_daemons_use_separate_endpoints_and_buses(
 
 
 def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
-    short_path: Path, networks: tuple[list[str], list[list[str]]], free_port: int
+    short_path: Path,
+    host_starter: Starter,
+    networks: tuple[list[str], list[list[str]]],
+    free_port: int,
 ) -> None:
     middle, prefixes = networks
-    starters = [Starter(prefix) for prefix in prefixes]
     robots = [
-        named(rig_in(short_path / f"r{number}", starters[number - 1], prefix, free_port), hand)
+        named(rig_in(short_path / f"r{number}", host_starter.inside(prefix), prefix, free_port), hand)
         for number, (prefix, hand) in enumerate(zip(prefixes, ("left", "right"), strict=True), 1)
     ]
     listen = [f"tcp/10.88.{number}.1:7447" for number in (1, 2)]
@@ -270,9 +272,8 @@ def test_a_remote_subscriber_gets_the_topics_of_two_robots_and_tracks_restarts(
             assert robot.end("bridge") == 0
             assert " 0 lost" in robot.printed("bridge")
     finally:
-        for robot, starter in zip(robots, starters, strict=True):
+        for robot in robots:
             robot.end_all()
-            starter.close()
         if remote is not None:
             remote.close()
 
