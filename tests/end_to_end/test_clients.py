@@ -23,7 +23,7 @@ from handtouch.client import columns, connect
 from tests.client.hand_messages import LINKS, make_contact, make_frame, make_service
 
 LONGEST_S = 120.0
-MESSAGES = 10_000
+MESSAGES = 1500
 LANGUAGES = ("cpp", "javascript")
 NOT_IN_CPP = ("v", "frame")
 
