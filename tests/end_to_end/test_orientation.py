@@ -19,7 +19,7 @@ from handtouch.simulate.worlds import WORLDS
 
 TOUCHED, UNTOUCHED = "palm_heel", "thumb_proximal"
 LINKS = (TOUCHED, UNTOUCHED, "palm_thumb", "index_distal")
-LEARNT_S, FAST_S = 30.0, 6.0
+LEARNT_S, FAST_S = 20.0, 5.0
 SKIN = "[skin]\ng_per_cm2 = 1.0\n"
 TOUCH = f"""
 [[touch]]
@@ -34,7 +34,7 @@ BY_GRAVITY = f"""
 from_s = 1.0
 duration_s = {LEARNT_S - 1}
 axis = [1.0, 0.3, 0.0]
-rev_s = 0.2
+rev_s = 0.3
 
 [[turn]]
 from_s = {LEARNT_S}
