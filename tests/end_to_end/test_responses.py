@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +13,14 @@ from handtouch import wire
 from handtouch.cli.demo import in_process_deployment
 from handtouch.config import Deployment, load, parse, shipped
 from handtouch.daemon.daemon import HandtouchDaemon
+from handtouch.field.measured import PressTable
+from handtouch.procedures.calibrate import find_pad
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.score import score_contacts
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.worlds import WORLDS, Family
 
-from .conftest import run_in_threads
+from .conftest import START_S, run_in_threads
 from .served_daemon import ServedDaemon
 
 TOUCHES = "".join(
@@ -106,3 +109,45 @@ def test_contacts_of_32_taxels_arrive_in_eight_tpdos(tmp_path: Path) -> None:
         (link,) = score_contacts(contacts, hand.truth).links
     assert link.pad_error_m < 2e-3
     assert link.position_coverage > 0.7
+
+
+PRESSES = [(x, y) for y in (0.15, 0.85) for x in (0.12, 0.4, 0.65, 0.88)]
+
+
+def press_scenario(quiet_s: float) -> str:
+    """Return presses of a finger, of which the zero before each is known."""
+    return "".join(
+        f"""
+[[touch]]
+link = "index_distal"
+from_s = {quiet_s + 1.3 * number:.2f}
+duration_s = 0.75
+path = [[{x}, {y}]]
+force_n = [1.0]
+"""
+        for number, (x, y) in enumerate(PRESSES)
+    )
+
+
+def test_presses_of_a_finger_become_its_map_guided_and_from_the_recording(rig: Any) -> None:
+    surface = find_pad(load(rig.config), "index_distal").pad.surface.build()
+    places_mm = 1e3 * np.array(PRESSES) * surface.extent_m
+    table = rig.folder / "places.csv"
+    table.write_text("x_mm,y_mm\n" + "".join(f"{x:.3f},{y:.3f}\n" for x, y in places_mm))
+    rig.scenario.write_text(press_scenario(quiet_s=1.2))
+    command = ["calibrate", "index_distal", "--config", str(rig.config), "--positions", str(table), "--map"]
+    files = {name: rig.folder / f"{name}.npz" for name in ("guided", "recorded")}
+    rig.start("run")
+    with rig.recording() as recording:
+        guided = rig.start_command(*command, str(files["guided"]), "--json")
+        rig.wait("asked", lambda _: "[1/8] press at" in rig.printed("calibrate"))
+        rig.start("simulate", "--world", "default", "--scenario", str(rig.scenario))
+        assert guided.wait(START_S) == 0, rig.all_printed()
+    assert rig.printed("calibrate").count("] press at (") == len(PRESSES)
+    status, printed = rig.call(*command, str(files["recorded"]), "--from", str(recording))
+    assert status == 0, printed
+    assert "what is stated" in printed
+    assert 'press_map = "recorded.npz" in the [[hand.pad]] of right/index_distal' in printed
+    presses = [PressTable(file.read_bytes()) for file in files.values()]
+    np.testing.assert_allclose(presses[0].signals, presses[1].signals, rtol=0.02)
+    np.testing.assert_allclose(1e3 * presses[0].place_m, places_mm, atol=1.0)

@@ -168,6 +168,36 @@ def _add_direct(direct: argparse._ArgumentGroup) -> None:
     )
 
 
+class _Setting(NamedTuple):
+    """Options of the direct setting."""
+
+    name: str | None
+    gains: Sequence[float] | None
+    offsets: Sequence[float] | None
+    law: Sequence[float] | None
+    second_law: Sequence[float] | None
+    hertz_force_n: float | None
+
+    @property
+    def has_values(self) -> bool:
+        return any(one is not None for one in (self.gains, self.offsets, self.law, self.second_law))
+
+    @property
+    def is_given(self) -> bool:
+        return self.has_values or self.name is not None
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the request."""
+        keys = "contact_ohm_mm2", "alpha", "ohm_per_square"
+        laws = {
+            name: {**dict(zip(keys, law, strict=True)), "hertz_force_n": self.hertz_force_n}
+            for name, law in (("law", self.law), ("second_law", self.second_law))
+            if law is not None
+        }
+        values = {"gains": self.gains, "offset_counts": self.offsets, "name": self.name}
+        return laws | {option: value for option, value in values.items() if value is not None}
+
+
 def run(
     pad: str,
     *,
@@ -191,45 +221,30 @@ def run(
     position_std_mm: float,
     **options: Any,
 ) -> int:
-    """Measure a contact law, set a calibration or print the active one; `options` of `CalibrateOptions`.
+    """Measure a contact law or a map, set a calibration or print the active one; `options` of
+    `CalibrateOptions`.
 
     Exit status 0, 1 (no law found, no daemon, refused), 2 (wrong usage or invalid file).
     """
-    if map is not None or positions is not None:
-        if map is None or positions is None or config is None:
-            raise CommandError("handtouch calibrate: --map needs --positions CSV and --config CONFIG", 2)
-        if weights or name is not None or new_sheet:
-            raise CommandError("handtouch calibrate: --map takes no weights and sets no calibration", 2)
-        with failing(2, ValueError, OSError):
-            stream = find_endpoint("live", live, config)
-        return _run_map(
-            _MapFiles(config, positions, from_file, map), pad, position_std_mm, stream, key, as_json
-        )
+    setting = _Setting(name, gains, offsets, law, second_law, hertz_force_n)
     sources = [bool(weights), from_file is not None, grasps is not None]
-    guided = any(sources)
-    values: dict[str, Any] = {
-        "gains": gains,
-        "offset_counts": offsets,
-        "law": law,
-        "second_law": second_law,
-    }
-    values = {option: value for option, value in values.items() if value is not None}
-    if hertz_force_n is not None and law is None:
-        raise CommandError("handtouch calibrate: --hertz-force-n is of the law that --law sets", 2)
-    if conflict := _find_conflict(guided, values, name, config, sum(sources) > 1):
+    if map is None and positions is None:
+        conflict = _find_conflict(sources, setting, config, new_sheet)
+    elif map is None or positions is None or config is None:
+        conflict = "--map needs --positions CSV and --config CONFIG"
+    else:
+        no_map = bool(weights) or grasps is not None or setting.is_given or new_sheet
+        conflict = "--map measures no law and sets no calibration" if no_map else ""
+    if conflict:
         raise CommandError(f"handtouch calibrate: {conflict}", 2)
     with failing(2, ValueError, OSError):
-        endpoint = find_endpoint("control", endpoint, config)
-        stream = find_endpoint("live", live, config)
-    if new_sheet:
-        if guided or values or name is not None or config is None:
-            raise CommandError("handtouch calibrate: --new-sheet takes --config CONFIG and nothing else", 2)
-        asked = calibrate.CalibrateOptions(pad=pad, config=config, as_json=as_json, **options)
-        return _run_new_sheet(asked, calibrate.DaemonEndpoints(stream, endpoint, key))
-    if from_file is not None and not from_file.is_file():
-        raise CommandError(f"{from_file}: no such file; --from reads readings that --log recorded", 2)
-    if guided and config is not None:
-        guided_options = calibrate.CalibrateOptions(
+        control, stream = find_endpoint("control", endpoint, config), find_endpoint("live", live, config)
+    endpoints = calibrate.DaemonEndpoints(stream, control, key)
+    if map is not None and positions is not None and config is not None:
+        files = _MapFiles(config, positions, from_file, map)
+        return _run_map(files, pad, position_std_mm, endpoints, as_json)
+    if config is not None and (new_sheet or any(sources)):
+        asked = calibrate.CalibrateOptions(
             pad=pad,
             config=config,
             weights=weights,
@@ -238,43 +253,43 @@ def run(
             as_json=as_json,
             **options,
         )
-        return _run_guided(guided_options, calibrate.DaemonEndpoints(stream, endpoint, key))
-    for name_of_law in {"law", "second_law"} & {*values}:
-        keys = "contact_ohm_mm2", "alpha", "ohm_per_square"
-        values[name_of_law] = dict(zip(keys, values[name_of_law], strict=True))
-        values[name_of_law]["hertz_force_n"] = hertz_force_n
-    if name is not None:
-        values["name"] = name
+        return (_run_new_sheet if new_sheet else _run_guided)(asked, endpoints)
     return requests.run_request(
         "calibrate",
         requests.calibration_lines,
-        endpoint=endpoint,
+        endpoint=control,
         key=key,
         as_json=as_json,
         pad=pad,
-        **values,
+        **setting.arguments(),
     )
 
 
-def _find_conflict(
-    guided: bool, values: dict[str, Any], name: str | None, config: Path | None, two_sources: bool
-) -> str:
-    """Return the conflict between options with its remedy; empty if there is none."""
-    if guided and (values or name is not None):
+def _find_conflict(sources: Sequence[bool], setting: _Setting, config: Path | None, new_sheet: bool) -> str:
+    """Return the conflict between options with its remedy; empty if there is none. sources: which of
+    `--weights`, `--from` and `--grasps` are given."""
+    guided = any(sources)
+    if setting.hertz_force_n is not None and setting.law is None:
+        return "--hertz-force-n is of the law that --law sets"
+    if new_sheet and (guided or setting.is_given or config is None):
+        return "--new-sheet takes --config CONFIG and nothing else"
+    if guided and setting.is_given:
         return (
             "--weights, --from and --grasps measure laws, --name, --gains, --offsets and --law set them; "
             "use either"
         )
     if guided and config is None:
         return "--config CONFIG is missing: the deployment file that the daemon runs with"
-    if two_sources:
+    if sum(sources) > 1:
         return "--weights measures, --from and --grasps read what was recorded; use either"
-    if values and name is None:
+    if setting.has_values and setting.name is None:
         return "--name NAME is missing: the id of the new calibration"
     return ""
 
 
 class _MapFiles(NamedTuple):
+    """Files of the options of `--map`."""
+
     config: Path
     positions: Path
     recording: Path | None
@@ -282,7 +297,11 @@ class _MapFiles(NamedTuple):
 
 
 def _run_map(
-    files: _MapFiles, pad: str, position_std_mm: float, stream: str, key: str | None, as_json: bool
+    files: _MapFiles,
+    pad: str,
+    position_std_mm: float,
+    endpoints: calibrate.DaemonEndpoints,
+    as_json: bool,
 ) -> int:
     """Measure a map and write it. Exit status 0; 1: the presses don't fit the places."""
     with failing(2, ValueError, OSError):
@@ -294,7 +313,7 @@ def _run_map(
         if files.recording is not None:
             _read_presses(files.recording, deployment, entry, collector)
         else:
-            _await_presses(stream, key, entry, places, collector)
+            _await_presses(endpoints, entry, places, collector)
     if len(collector.presses) != len(places):
         raise CommandError(
             f"{len(collector.presses)} presses were held long enough, {files.positions} has {len(places)} "
@@ -303,8 +322,8 @@ def _run_map(
         )
     with failing(1, ValueError, OSError):
         presses = job.presses(collector.presses, places, collector.samples, position_std_mm)
-        files.out.write_bytes(presses.data)
         report = job.report(presses)
+        files.out.write_bytes(presses.data)
     if as_json:
         print_json({"file": str(files.out), **asdict(report)})
     else:
@@ -330,8 +349,7 @@ def _read_presses(
 
 
 def _await_presses(
-    stream: str,
-    key: str | None,
+    endpoints: calibrate.DaemonEndpoints,
     entry: NamedPad,
     places: Sequence[press_map.Place],
     collector: press_map.PressCollector,
@@ -339,7 +357,7 @@ def _await_presses(
     """Ask for the presses one by one on standard error, and collect them."""
     column, asked = wire.COLUMNS[wire.Raw]["counts"], -1
     topics = f"raw/{entry.hand}", f"contact/{entry.name}"
-    with contextlib.closing(client.connect(*topics, endpoint=stream, key=key)) as messages:
+    with client.connect(*topics, endpoint=endpoints.live, key=endpoints.key) as messages:
         while (done := len(collector.presses)) < len(places):
             if asked != done:
                 at = ", ".join(f"{1e3 * part:.1f}" for part in places[done].at_m)
@@ -348,6 +366,7 @@ def _await_presses(
             message = messages.recv(1.0)
             if isinstance(message, wire.Contact) and not message.retained:
                 collector.add_event(message.event)
+                asked = -1 if message.event == "end" else asked  # again, if it was too short
             elif isinstance(message, wire.Raw):
                 counts = column.to_array(message.counts, len(message.links))
                 row = message.links.index(entry.pad.link)
@@ -368,6 +387,8 @@ def _run_new_sheet(options: calibrate.CalibrateOptions, endpoints: calibrate.Dae
 
 
 def _run_guided(options: calibrate.CalibrateOptions, endpoints: calibrate.DaemonEndpoints) -> int:
+    if options.from_file is not None and not options.from_file.is_file():
+        raise CommandError(f"{options.from_file}: no such file; --from reads readings that --log recorded", 2)
     # RuntimeError: the daemon refuses
     with failing(2, ValueError), failing(1, calibrate.CalibrationError, StoreError, OSError, RuntimeError):
         if (file := options.from_file or options.grasps) is not None:

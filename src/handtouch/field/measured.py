@@ -50,10 +50,11 @@ class PressTable:
     surface from the corner of x0 and y0, with `z_mm` coordinates of the pad frame; `signals` (k, n), changes
     of the n channels by a press in the unit of the node's counts, mA where it measures currents. Optional:
     `force_n` (k,), which a pad without a theory needs; `position_std_mm` (1 sigma along each axis),
-    `signal_std`, noise of a signal, and `serial`, that of the node. Raises ValueError for what isn't.
+    `signal_std`, noise of a signal, and `serial`, that of the node. min_presses: least k. Raises ValueError
+    for what isn't.
     """
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, min_presses: int = MIN_PRESSES) -> None:
         self.data = data
         """content of the file"""
         try:
@@ -68,9 +69,9 @@ class PressTable:
         """(k, n)"""
         count = len(self.signals)
         columns = [found[name] for name in axes] + [found.get("force_n", np.ones(count))]
-        if self.signals.ndim != 2 or count < MIN_PRESSES or any(one.shape != (count,) for one in columns):
+        if self.signals.ndim != 2 or count < min_presses or any(one.shape != (count,) for one in columns):
             raise ValueError(
-                f"signals must have a row for each of {MIN_PRESSES} presses or more, and {', '.join(axes)} "
+                f"signals must have a row for each of {min_presses} presses or more, and {', '.join(axes)} "
                 "(and force_n) a value for each"
             )
         if not all(np.isfinite(values).all() for values in found.values()):
@@ -116,7 +117,7 @@ class PressTable:
         return file.getvalue()
 
     def chosen(self, rows: npt.NDArray[Any]) -> PressTable:
-        """Return the table of some presses, by their numbers or a mask."""
+        """Return the table of some presses, one or more, by their numbers or a mask."""
         force_n = None if self.force_n is None else self.force_n[rows]
         return PressTable(
             self.content(
@@ -126,7 +127,8 @@ class PressTable:
                 position_std_m=self.position_std_m,
                 signal_std=self.signal_std,
                 serial=self.serial,
-            )
+            ),
+            min_presses=1,
         )
 
 
