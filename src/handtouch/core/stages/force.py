@@ -426,7 +426,7 @@ def find_crowding(
     Set what `crowded_shift` needs: `turning`, the share of the current that turns to the edge, s = I2(x) /
     I0(x), with its derivative by the stack factor, for the factor that is left by `around`, the sheet's
     resistance around a contact at the current's centre; `square` and `log_radius` of the radius. Set
-    `shift_std` [m^2], the deviation of the shift by the radius.
+    `shift_std` [m^2], the deviation of the shift by the radius and by the film's resistance.
 
     Set `tilt_m` [m]: how far the centres of current and pressure are from each other where the pressure
     rises from the middle to the rim by its mean. The pressure's is A / 4 from the middle, the current's is
@@ -449,7 +449,10 @@ def find_crowding(
     result.square, result.log_radius = math.exp(2.0 * radius), radius
     result.turning, result.turning_by_factor, result.around = share, by_factor, left - factor
     by_radius = result.square * (share + 0.5 * by_factor) * slope / (slope - growth)
-    result.shift_std = abs(by_radius) * math.sqrt(law.parameters[0].radius_variance)
+    # a film of more resistance leaves the layer less: the factor that is left goes as 1 over it
+    by_film = result.square * (growth * share + 0.5 * by_factor * slope) / (slope - growth) * left
+    variance = by_radius * by_radius * law.parameters[0].radius_variance
+    result.shift_std = math.sqrt(variance + by_film * by_film * law.parameters[0].covariance[5])
     uneven = (1.0 - 0.5 * law.parameters[0].by_radius) * (1.0 - share) - 1.0
     result.tilt_m = 0.25 * math.exp(radius) * math.sqrt(uneven * uneven + _TILT_REST * _TILT_REST)
 
