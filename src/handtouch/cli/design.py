@@ -119,13 +119,18 @@ def run(
         files, no_tables = _write(config_path, task, result, world, out, progress)
         forces_n = _sheet_forces(task)
         sheets = compare_sheets(task, forces_n) if goal == "force" else []
+        films_mm = _by_films(task, result) if goal == "position" and electrodes is None else None
     if as_json:
         made = _as_json(task, result, simulated, files) | {"no_tables": no_tables}
+        if films_mm is not None:
+            made |= {"two_layers": dict(zip(("known_leads", "unknown_leads"), films_mm, strict=True))}
         if sheets:
             made |= {"sheets": [asdict(case) for case in sheets], "sheet_forces_n": forces_n}
         print_json(made)
     else:
         _print(task, result, world, simulated, files, no_tables)
+        if films_mm is not None:
+            _print_films(*films_mm)
         if sheets:
             _print_sheets(forces_n, sheets)
     return 0
@@ -217,6 +222,28 @@ def _write(
         (out / name).write_text(text, encoding="utf-8")
         files.append(out / name)
     return files, no_tables
+
+
+def _by_films(task: PadTask, result: DesignResult) -> tuple[float, float]:
+    """Return the goal `position` [mm] of two films on the pad's wires, with known leads and unknown ones."""
+    from handtouch.design.films import LEAD_STD_OHM, film_position_std
+    from handtouch.design.goals import goal_value
+
+    fine = task.with_points(len(result.map_after))
+    known, unknown = (
+        goal_value(result.goal.factor * film_position_std(fine, lead_ohm), result.statistic)
+        for lead_ohm in (0.0, LEAD_STD_OHM)
+    )
+    return known, unknown
+
+
+def _print_films(known_mm: float, unknown_mm: float) -> None:
+    from handtouch.design.films import FILM_OHM, LEAD_STD_OHM
+
+    print(
+        f"two films of {FILM_OHM:g} ohm per square on the same four wires: {known_mm:.4g} mm, "
+        f"{unknown_mm:.4g} mm where leads are unknown by {LEAD_STD_OHM:g} ohm (docs/responses.md#two-layers)"
+    )
 
 
 def _sheet_forces(task: PadTask) -> list[float]:

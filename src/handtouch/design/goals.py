@@ -65,8 +65,7 @@ def smooth_value(values: FloatArray, statistic: Statistic) -> float:
 
 def position_std(task: PadTask, layout: ElectrodeLayout) -> FloatArray:
     """Return the root of the sum of both coordinates' variances [m]."""
-    covariance = contact_response(task, layout).estimate_covariance
-    return np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
+    return contact_response(task, layout).position_std
 
 
 def force_std(task: PadTask, layout: ElectrodeLayout) -> FloatArray:

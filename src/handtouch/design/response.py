@@ -46,6 +46,12 @@ class ContactResponse:
         information = np.swapaxes(self.slopes, -1, -2) @ np.linalg.solve(self.covariance, self.slopes)
         return np.asarray(np.linalg.inv(information))
 
+    @property
+    def position_std(self) -> FloatArray:
+        """Root of the sum of both coordinates' variances (k,) [m]."""
+        covariance = self.estimate_covariance
+        return np.asarray(np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1]))
+
 
 def contact_response(
     task: PadTask, layout: ElectrodeLayout, with_force: bool = False, with_bends: bool = False
