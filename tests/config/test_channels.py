@@ -34,6 +34,7 @@ TACTOR = ("0x2110:0", "0x2120:0", "0x2130:0", "0x2140:0")
         ("0x2001:0:u24", (0x2001, 0, ValueType(24, False), None)),
         ("0x2001:0xFE:i32", (0x2001, 254, ValueType(32), None)),
         ("0xABCD:17:u8", (0xABCD, 17, ValueType(8, False), None)),
+        ("0x6401:5:i12", (0x6401, 5, ValueType(12), None)),
         ("0x6403:1:f32/1000", (0x6403, 1, REAL32, 1000.0)),
         ("0x6403:1:f32/2.5e-3", (0x6403, 1, REAL32, 0.0025)),
     ],
@@ -49,7 +50,8 @@ def test_objects_are_written_as_index_sub_and_type(text: str, found: object) -> 
         "6401:1",
         "0x6401",
         "0x6401:255",
-        "0x6401:1:u12",
+        "0x6401:1:u7",
+        "0x6401:1:u33",
         "0x6401:1:f32",
         "0x0000:1",
         "0x64010:1",
@@ -116,6 +118,8 @@ def test_written_objects_need_their_type() -> None:
         parse_writable_object("0x2100:0")
     with pytest.raises(EdsError, match="is REAL32; only integers are written"):
         parse_writable_object("0x6429:1:f32/1000")
+    with pytest.raises(EdsError, match="has 12 bits; objects of 8, 16, 24 and 32 bits are written"):
+        parse_writable_object("0x2100:0:u12")
 
 
 def test_shipped_node_is_the_standard_one() -> None:

@@ -71,6 +71,29 @@ def test_a_pad_may_have_another_number_of_channels(tmp_path: Path, count: int) -
         adc.close()
 
 
+def test_five_channels_of_12_bits_are_in_one_tpdo(tmp_path: Path) -> None:
+    adc = AdcStandIn(tmp_path, channels=5)
+    bench = NodeBench(tmp_path, adc)
+    try:
+        adc.set_raw([*raw_of_ma([1.0, 2.0, -3.0, 4.0]), 1 << 30])
+        channels = ", ".join(f'"voltage{k}"' for k in range(5))
+        bench.start(
+            pad=f'[[pad]]\nname = "tip"\nnode_id = 5\nserial = 77\nadc = "main"\ngain_ohm = -240.0\n'
+            f"bits = 12\nchannels = [{channels}]"
+        )
+        frames = bench.sync()
+        assert [(identifier, len(data)) for identifier, data in frames] == [(0x285, 8)]
+        word = int.from_bytes(frames[0][1], "little")
+        counts = [(word >> 12 * k & 0xFFF ^ 0x800) - 0x800 for k in range(5)]
+        assert counts == pytest.approx([205, 409, -614, 819, -2048], abs=1)
+        assert word >> 60 == 0
+        emergencies = [data for _ in range(5) for identifier, data in bench.sync() if identifier == 0x85]
+        assert [data[4] for data in emergencies] == [1 << 4]
+    finally:
+        bench.service.close()
+        adc.close()
+
+
 def test_offset_and_scale_of_iio_may_be_shared_by_all_channels(bench: Any) -> None:
     for channel in range(4):
         (bench.adc.folder / f"in_voltage{channel}_scale").unlink()

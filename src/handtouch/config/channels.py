@@ -24,7 +24,7 @@ MAX_CHANNEL_BITS = 32
 _MIN_CONVERTER_BITS = 8  # no converter of a sensor node has fewer
 _OBJECT_PATTERN = re.compile(
     r"0x([0-9A-Fa-f]{4}):(0x[0-9A-Fa-f]{1,2}|\d{1,3})"
-    r"(?::(?:([iu])(8|16|24|32)|f32/(\d+(?:\.\d+)?(?:e[+-]?\d+)?)))?"
+    r"(?::(?:([iu])([89]|[12]\d|3[0-2])|f32/(\d+(?:\.\d+)?(?:e[+-]?\d+)?)))?"
 )
 PROFILE_TYPES = {  # CiA 401 and CiA 404: read analogue input, process and field values
     0x6100: REAL32,
@@ -115,8 +115,9 @@ STANDARD_CHANNELS: Channels = (
 def parse_object(text: str) -> tuple[int, int, ValueType | None, float | None]:
     """Return index, sub-index, type and counts per unit of INDEX:SUB[:TYPE].
 
-    "0x2001:0:u24" is an integer, "0x6403:1:f32/1000" REAL32 with 1000 counts per unit; the type is None where
-    it is left out, the counts per unit are None for all but REAL32. Raises EdsError for any other form.
+    "0x2001:0:u24" is an integer of 8 to 32 bits, "0x6403:1:f32/1000" REAL32 with 1000 counts per unit; the
+    type is None where it is left out, the counts per unit are None for all but REAL32. Raises EdsError for
+    any other form.
     """
     form = _OBJECT_PATTERN.fullmatch(text)
     if form is None or not int(form[1], 16) >= 1 or int(form[2], 0) > 254:
@@ -172,6 +173,8 @@ def parse_writable_object(text: str) -> WritableObject:
         raise eds.EdsError(f'"{text}": its type is missing; add it: "{text}:u8"')
     if kind.is_real:
         raise eds.EdsError(f'"{text}" is REAL32; only integers are written')
+    if kind.bits % 8:
+        raise eds.EdsError(f'"{text}" has {kind.bits} bits; objects of 8, 16, 24 and 32 bits are written')
     return WritableObject(index, sub, kind.bits // 8)
 
 

@@ -197,7 +197,7 @@ class Node(Table):
     channels: Annotated[tuple[str, ...], PER_CHANNEL] = Field(
         ("0x6401:1", "0x6401:2", "0x6401:3", "0x6401:4"),
         description=f"objects of the {CHANNEL_RANGE} channels, INDEX:SUB; with a type (i16, u24) where no "
-        "EDS has it, REAL32 as f32/1000 for 1000 counts per unit",
+        "EDS has it, i12 where a TPDO carries its low 12 bits, REAL32 as f32/1000 for 1000 counts per unit",
     )
     allow_pdo_remapping: bool = Field(
         True, description="map the channels to a TPDO over SDO if no TPDO of the node carries them"

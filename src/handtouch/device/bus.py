@@ -156,17 +156,24 @@ class DeviceBus:
         return self._append_lss_device(UnconfiguredDevice(self, self._rows, spec, lss_compares=lss_compares))
 
     def add_stored(
-        self, serial: int, node_id: int | None, store: StoreId, channels: int = CHANNELS
+        self,
+        serial: int,
+        node_id: int | None,
+        store: StoreId,
+        channels: int = CHANNELS,
+        *,
+        is_packed: bool = False,
     ) -> UnconfiguredDevice:
         """Add a node of a shipped EDS with a stored id, None for none, whose inputs the sampler measures.
 
-        `store` is called for an id that LSS has stored. Raises ValueError for an id in use.
+        `is_packed` : its channels have 12 bits, up to five in one TPDO; `store` is called for an id that LSS
+        has stored. Raises ValueError for an id in use.
         """
         if node_id in (device.lss.stored_id for device in self._unconfigured if node_id is not None):
             raise ValueError(f"node_id must be used once, got {node_id}")
         addresses = tuple((cia301.ANALOGUE_INPUTS, sub + 1) for sub in range(channels))
         spec = DeviceSpec(
-            _eds_path(None, channels),
+            _eds_path(shipped.path("handtouch-node-12bit.eds") if is_packed else None, channels),
             None,
             None,
             serial,

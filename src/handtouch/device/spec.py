@@ -71,7 +71,10 @@ class DeviceSpec:
         return self.excitation
 
     def channel_limits(self, objects: ObjectValues) -> ChannelLimits:
-        """Return the minimum and maximum count of each channel. Raises ValueError for unsuitable objects."""
+        """Return the minimum and maximum count of each channel: what its TPDO carries of its object.
+
+        Raises ValueError for unsuitable objects.
+        """
         if (
             len(set(self.channels)) != len(self.channels)
             or not MIN_CHANNELS <= len(self.channels) <= MAX_CHANNELS
@@ -79,6 +82,8 @@ class DeviceSpec:
             raise ValueError(
                 f"channels must be {MIN_CHANNELS} to {MAX_CHANNELS} different objects, got {self.channels}"
             )
+        tpdos = eds.default_tpdos(objects.object_dictionary)
+        carried = {(index, sub): bits for tpdo in tpdos for index, sub, bits in tpdo.entries}
         limits = []
         for index, sub in self.channels:
             kind = REAL32[:2] if objects.is_real32(index, sub) else objects.integer_type(index, sub)
@@ -87,5 +92,6 @@ class DeviceSpec:
                     f"{self.eds}: has no integer or REAL32 0x{index:04X}:{sub:02X} to carry a channel; "
                     "name the objects of the channels in `channels`"
                 )
-            limits.append(integer_limits(*kind))
+            bits, signed = kind
+            limits.append(integer_limits(min(bits, carried.get((index, sub), bits)), signed))
         return limits

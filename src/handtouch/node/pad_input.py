@@ -1,6 +1,6 @@
 """Input of one pad: currents and counts of its ADC's channels, and its failures as EMCY messages.
 
-Public names: `PadInput`, `MAX_COUNT`.
+Public name: `PadInput`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from handtouch.node.adc_fault import AdcError, AdcFaultKind, emergency_of
 from handtouch.node.iio import FloatArray
 from handtouch.node.settings import NodePad, Trim
 
-MAX_COUNT = 32767
-_MIN_END_COUNTS = MAX_COUNT / 50  # of a negative end: one nearer to zero is the offset of a converter without
+_MIN_END = 1 / 50  # of a negative end, over the positive one: nearer to zero, it is the offset of a converter
 _SATURATED_SAMPLES = 3  # in succession, before a channel is reported
 _SATURATED_HOLD_NS = 1_000_000_000  # since the last one, before it is reported as recovered
 
@@ -52,9 +51,14 @@ class PadInput:
         return tuple(self._faults)
 
     @property
+    def max_count(self) -> int:
+        """Greatest count of a channel."""
+        return (1 << self.pad.bits - 1) - 1
+
+    @property
     def counts_per_ma(self) -> float:
         """Counts per milliampere, or per unit of values that aren't currents."""
-        return MAX_COUNT / self.pad.full_scale_signal
+        return self.max_count / self.pad.full_scale_signal
 
     @property
     def step_ma(self) -> FloatArray:
@@ -75,17 +79,18 @@ class PadInput:
         return np.asarray((measured - self._offset_ma) * self._gain)
 
     def counts(self, currents_ma: FloatArray, ends_ma: FloatArray) -> NDArray[np.int64]:
-        """Return the counts (c,) of currents, limited to 16 bits.
+        """Return the counts (c,) of currents, limited to the channels' bits.
 
         A channel at one of the ends (2, c) of its range gets that end of the counts': the daemon knows by it
         that it is saturated. An end near no current is none: a converter without negative values is there
         while nothing touches.
         """
-        counts = np.clip(np.rint(currents_ma * self.counts_per_ma), -MAX_COUNT - 1, MAX_COUNT)
+        most = self.max_count
+        counts = np.clip(np.rint(currents_ma * self.counts_per_ma), -most - 1, most)
         low_ma, high_ma = np.sort(ends_ma, axis=0)
-        counts[currents_ma >= high_ma] = MAX_COUNT
-        has_bottom = low_ma * self.counts_per_ma < -_MIN_END_COUNTS
-        counts[has_bottom & (currents_ma <= low_ma)] = -MAX_COUNT - 1
+        counts[currents_ma >= high_ma] = most
+        has_bottom = low_ma * self.counts_per_ma < -_MIN_END * most
+        counts[has_bottom & (currents_ma <= low_ma)] = -most - 1
         return counts.astype(np.int64)
 
     def record_sample(self, at_limit: NDArray[np.bool_], now_ns: int) -> None:

@@ -19,7 +19,7 @@ from handtouch.device import UnconfiguredDevice
 from handtouch.node.adc_fault import AdcError
 from handtouch.node.buffered import BufferedReader
 from handtouch.node.iio import AdcReader, AdcReading, FloatArray, OneShotReader
-from handtouch.node.pad_input import MAX_COUNT, PadInput
+from handtouch.node.pad_input import PadInput
 from handtouch.node.settings import Adc, NodeFile
 
 _WINDOW_SAMPLES = 2000
@@ -119,7 +119,7 @@ class AdcInput:
         for pad, row, current_ma, ends_ma in zip(self.pads, self.rows, currents, self._ends_ma, strict=True):
             own = counts[row, : len(current_ma)]
             own[:] = pad.counts(current_ma, ends_ma)
-            pad.record_sample((own >= MAX_COUNT) | (own < -MAX_COUNT), now_ns)
+            pad.record_sample((own >= pad.max_count) | (own < -pad.max_count), now_ns)
 
     def read_currents_ma(self) -> list[FloatArray] | None:
         """Return the currents (c,) of each pad [mA], None without a recent conversion. Raises AdcError."""

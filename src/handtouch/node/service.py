@@ -30,7 +30,7 @@ from handtouch.node.excitation import make_switch
 from handtouch.node.identity_store import IdentityStore
 from handtouch.node.pad_input import PadInput
 from handtouch.node.sampling import Sampling, make_inputs
-from handtouch.node.settings import NodeFile, NodePad
+from handtouch.node.settings import PACKED_BITS, NodeFile, NodePad
 
 _MAINTENANCE_PERIOD_NS = 20_000_000
 _REPORT_PERIOD_NS = 60_000_000_000
@@ -156,7 +156,11 @@ class NodeService:
     def _add_node(self, pad: NodePad) -> UnconfiguredDevice:
         identity = self._store.identity(pad.name, pad.serial, pad.node_id)
         node = self.devices.add_stored(
-            identity.serial, identity.node_id, partial(self._store_id, pad.name), len(pad.channels)
+            identity.serial,
+            identity.node_id,
+            partial(self._store_id, pad.name),
+            len(pad.channels),
+            is_packed=pad.bits == PACKED_BITS,
         )
         shown = "none; assign one by LSS" if identity.node_id is None else f"0x{identity.node_id:02X}"
         _log.info("pad %s: serial number %d, node id %s", pad.name, identity.serial, shown)

@@ -1,6 +1,6 @@
 """File of a sensor node (TOML) -> frozen, checked objects; errors name file, key, value and remedy.
 
-Public names: `load`, `json_schema`, `NodeFile`, `TouchNode` and its tables.
+Public names: `load`, `json_schema`, `NodeFile`, `PACKED_BITS`, `PACKED_CHANNELS`, `TouchNode` and its tables.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ else:
 PerChannel = Annotated[tuple[float, ...], Field(strict=False)]
 Serial = Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 _Model = TypeVar("_Model", bound=Table)
+PACKED_BITS, PACKED_CHANNELS = 12, 5
+"""Bits of a channel, and channels, of a node that sends all in one TPDO."""
 _MAX_DRAIN_PERIOD_S = 0.1  # between two readings of a buffer's queue, on a busy machine
 
 
@@ -150,11 +152,16 @@ class NodePad(Table):
         "where they fall with the current",
         examples=[0.0204],
     )
-    full_scale_ma: Positive = Field(10.0, description="current at count 32767, as in the deployment")
+    bits: Literal[12, 16] = Field(
+        16,
+        description="bits of a channel's counts; with 12, up to five channels are in one TPDO, and of type "
+        'i12 in the deployment: "0x6401:1:i12"',
+    )
+    full_scale_ma: Positive = Field(10.0, description="current at the greatest count, as in the deployment")
     full_scale: float | None = Field(
         None,
-        description="of another source whose values aren't currents: value at count 32767, negative where "
-        "they fall with the force; instead of ma_per_unit and full_scale_ma",
+        description="of another source whose values aren't currents: value at the greatest count, negative "
+        "where they fall with the force; instead of ma_per_unit and full_scale_ma",
         examples=[4095.0],
     )
     trim: str | None = Field(
@@ -186,11 +193,13 @@ class NodePad(Table):
             raise ValueError("give either adc or source: the name of an [adc.NAME] or a [source.NAME]")
         if len(set(self.channels)) < len(self.channels):
             raise ValueError("channels must be different ones")
+        if self.bits == PACKED_BITS and len(self.channels) > PACKED_CHANNELS:
+            raise ValueError(f"bits = {PACKED_BITS}: at most {PACKED_CHANNELS} channels fit into a TPDO")
         return self
 
     @property
     def full_scale_signal(self) -> float:
-        """Signal at count 32767: a current [mA], or in the unit of a source whose values aren't currents."""
+        """Signal at the greatest count: a current [mA], or in the unit of other values of a source."""
         return self.full_scale_ma if self.full_scale is None else abs(self.full_scale)
 
     def ma_per_unit_of(self, channel: str) -> float:

@@ -79,7 +79,7 @@ def _further_bits(deployment: config.Deployment, bus: config.Bus) -> int:
     for _, pad in deployment.pads_on(bus.name):
         if pad.switch_states:  # one state, and one TPDO, in each cycle
             continue
-        size = sum(channel.bits for channel in node_channels(deployment.nodes[pad.node])) // 8
+        size = math.ceil(sum(channel.bits for channel in node_channels(deployment.nodes[pad.node])) / 8)
         for first in range(SAMPLE_DATA_BYTES, size, SAMPLE_DATA_BYTES):
             total += frame_bits(min(SAMPLE_DATA_BYTES, size - first))
     return total

@@ -260,7 +260,7 @@ def _is_channel_entry(entry: int) -> bool:
     """Return True if a mapping entry may be a channel: a number's width, no dummy entry, and no object of
     digital inputs (0x6000 to 0x60FF, where CiA 402 has the state of drives, too)."""
     index = entry >> 16
-    return entry & 0xFF in (8, 16, 24, 32) and index >= 0x2000 and not 0x6000 <= index < 0x6100
+    return 8 <= entry & 0xFF <= 32 and index >= 0x2000 and not 0x6000 <= index < 0x6100
 
 
 def _state_name(state: int) -> str:
