@@ -83,6 +83,15 @@ def test_the_baseline_of_a_touched_pad_is_held_for_an_hour() -> None:
     assert rig.baseline.expected_counts[0] == pytest.approx(3.0, abs=1e-6)
 
 
+def test_the_noise_of_untouched_pads_moves_no_touched_one() -> None:
+    rig = Rig(pads=11, period_ns=100_000_000, noise=1.0)
+    rig.run(60.0, lambda _: 0.0)
+    before = rig.baseline.expected_counts[0].copy()
+    rig.run(1200.0, lambda _: only(0, 300.0, pads=11))
+    assert rig.touching[0]
+    assert np.abs(rig.baseline.expected_counts[0] - before).max() < 0.8  # a median's walk: 0.2 (1 sigma)
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.3, 2.0), st.floats(-1.0, 12.0)), min_size=1, max_size=5),

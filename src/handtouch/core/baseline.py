@@ -49,6 +49,9 @@ _DRIFT_SPEED_GAIN = 0.2  # gain of such a measurement
 _INITIAL_DRIFT_SIGMA_PER_S = 0.02  # initial drift over the noise
 _MAX_RETURN_FRACTION = 0.5  # distance of a released pad from its baseline over the end threshold
 _CONFIDENCE_SIGMA = 3.0  # deviations of an untouched pad up to a threshold
+_FOLLOWED_SIGMA = 5.0
+"""Of a block's mean that is followed as a fall: at 3, noise lowers a channel's baseline 50 times an hour, and
+the common drift, a median, rises: an object held for an hour read 3 % less"""
 _MIN_COMMON_DRIFT_PADS = 3  # untouched pads of a hand
 _FALLING_TIME_S = 2.0  # time constant of readings that no contact causes
 _MAX_FALL_SIGMA = 10.0  # more is a step: such samples are implausible, see `stages.detect`
@@ -200,7 +203,7 @@ class Baseline:
         mean_std = self._channel_noise / np.sqrt(np.maximum(self._count, 1.0))[:, None]
         # hum of which the samples above a threshold were left out
         whole = ~self._swings() | (self._count >= self._span_count)
-        falls = whole & self._falls(mean, mean_std)
+        falls = whole & self._falls(mean, _CONFIDENCE_SIGMA * mean_std)
         self._follow_falls_in_touch()
         self._end_drifted_contacts(sync_ns, elapsed_ns * 1e-9)
         shifted = self.held & (mean < -_MAX_FALL_SIGMA * self._noise[:, None]).any(axis=1)
@@ -211,7 +214,8 @@ class Baseline:
         free = sampled & ~self.held
         dt_s = np.asarray((sync_ns - self._drift_until_ns) * 1e-9, np.float64)
         np.copyto(self._drift_until_ns, sync_ns, where=free | self.held)
-        moved = self._track_offsets(mean, falls, free, dt_s)
+        followed = falls & self._falls(mean, _FOLLOWED_SIGMA * mean_std)
+        moved = self._track_offsets(mean, followed, free, dt_s)
         self._update_drift(moved, free & ~self._may_be_contact(mean, mean_std), free, elapsed_ns * 1e-9, dt_s)
         self._blocks[0] += 1
         if self._blocks[0] % _NOISE_PERIOD_BLOCKS == 0:
@@ -256,9 +260,12 @@ class Baseline:
         """Return the pads (n,) that cross their mean faster than a hand touches."""
         return np.asarray(self._span_crossings >= np.minimum(_MIN_CROSSINGS, self._span_count - 2))
 
-    def _falls(self, mean: FloatArray, mean_std: FloatArray) -> BoolArray:
-        """Return the pads (n,) with a channel so much below the baseline that no contact explains it."""
-        least = _MIN_FALL_FRACTION * (np.abs(mean) @ self._ones)[:, None] + _CONFIDENCE_SIGMA * mean_std
+    def _falls(self, mean: FloatArray, margin: FloatArray) -> BoolArray:
+        """Return the pads (n,) with a channel so much below the baseline that no contact explains it.
+
+        margin: (n, c), what its noise may be.
+        """
+        least = _MIN_FALL_FRACTION * (np.abs(mean) @ self._ones)[:, None] + margin
         return np.asarray((mean < -least).any(axis=1))
 
     def _learn_zeros(self, unknown: BoolArray, mean: FloatArray, mean_std: FloatArray) -> None:
