@@ -14,8 +14,13 @@ table has the radius with its standard deviation; 3 mm, whatever the contact. *C
 `handtouch calibrate` fits to weights of 20 to 500 gf on each pad, each placed twice on feet of 2 and 4 mm
 radius, known within 3 % and stated within 5 %.
 
+*Least errors*: those of an estimator that knows the true laws, resistances and history of a pad's sheets and
+how radii are distributed, for even discs in its middle: what is left is the scatter of the sheets from press
+to press, their flicker and noise.
+
 *Grasps*: those of [grasp](grasp.md), in which MuJoCo's patches have radii of 0.5 to 5 mm; samples of one
-patch on a pad, up to 5 N. With one sheet the file states 2.5 +- 0.5 mm as there; with two 3 +- 1.5 mm.
+patch on a pad, up to 5 N. With one sheet the file states 2.5 +- 0.5 mm as there; with two 3 +- 1.5 mm. The
+hand has been used before: its sheets are fresh, and stored as such.
 
 *Hours*: mixed use in `default`, all pads at once: round contacts of 0.1 to 5 N, 2 to 40 s long (log-uniform)
 and 2 to 120 s apart, with breaks of 5 to 20 minutes. *Radii unknown*: of 1 to 5 mm (log-uniform), stated as 3
@@ -27,7 +32,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -40,6 +45,7 @@ from benchmarks import hand_touches
 from benchmarks.bench_worlds import with_stated_touches
 from benchmarks.grasp_run import drawn_world, served
 from benchmarks.hand_touches import TouchReadings, draw_touches
+from benchmarks.known_sheets import known_sheets
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import MANY_SIGMA, Share
 from benchmarks.two_sheets import weigh, with_radii, with_second_sheets
@@ -63,6 +69,8 @@ FORCES_N = (0.1, 5.0)
 RADIUS_MM, RADIUS_STD_MM = 3.0, 1.0
 GRASP_RADII = {"one sheet": (2.5, 0.5), "two sheets": (3.0, 1.5)}
 WARM_UP = 16
+LEAST_DRAWS = 20
+"""Of each pad"""
 COLUMNS = (
     "true_n", "force_n", "force_std_n", "force_valid", "true_m", "radius_m", "radius_std_m", "radius_valid",
     "pad", "profile", "elongation",
@@ -152,7 +160,7 @@ def radius_on_pad(
 def grasp_rows(name: str, seed: int, sheets: str, world: str) -> FloatArray:
     """Return the samples (n, COLUMNS) of one patch on a pad, up to 5 N, of a grasp."""
     deployment = with_radii(deployment_with(sheets), *GRASP_RADII[sheets])
-    run = served(deployment, name, seed, drawn_world(world, seed))
+    run = served(deployment, name, seed, drawn_world(world, seed), used_before=True)
     links, rows = [pad.link for pad in deployment.hands[0].pads], []
     for contact in run.contacts:
         pad = links.index(contact.link)
@@ -164,6 +172,27 @@ def grasp_rows(name: str, seed: int, sheets: str, world: str) -> FloatArray:
         radius_m = float(run.patches.radius_m[step, pad][discs.argmax()])
         rows.append(row_of(contact, float(discs.max()), radius_m, 1000 * seed + pad))
     return np.array(rows).reshape(-1, len(COLUMNS))
+
+
+def least_errors(task: tuple[str, int, str]) -> FloatArray:
+    """Return relative errors (n, 2) of force and radius of the best estimator: name of the world, number of
+    the hand, its sheets."""
+    name, number, sheets = task
+    drawn = replace(WORLDS[name], mounts=MountSpread()).draw(Family.REPORTING.seed(number))
+    deployment = drawn.describe(with_radii(deployment_with(sheets), RADIUS_MM, RADIUS_STD_MM))
+    rng, (low, high) = np.random.default_rng((drawn.seed, 11)), np.log(FORCES_N)
+    return np.concatenate(
+        [
+            pad.errors(np.exp(rng.uniform(low, high, LEAST_DRAWS)), rng)
+            for pad in known_sheets(deployment, drawn)
+        ]
+    )
+
+
+def least_row(case: str, errors: FloatArray) -> dict[str, Any]:
+    """Return a row of the least errors of force and radius."""
+    force, radius = 100 * np.median(np.abs(errors), axis=0)
+    return {"case": case, "draws": len(errors), "force, median error, %": force, "radius, %": radius}
 
 
 def use_for_hours(task: tuple[int, float, bool, str]) -> FloatArray:
@@ -290,34 +319,55 @@ def main() -> None:
             for case, rows in zip([case for case in CASES if case.startswith(task[3])], tables, strict=True):
                 parts[task[0], case].append(rows)
             progress(f"{task[0]}, {task[3]}: hand {task[1] + 1}")
-    report = Report(asked.quick, hands=asked.hands, touches_of_a_pad=asked.touches, seeds=asked.seeds)
-    add_tables(report, {key: np.concatenate(made) for key, made in parts.items()}, "Touches")
-    if asked.seeds:
-        grasps = {
-            (world, sheets): np.concatenate(joined(asked.objects, asked.seeds, sheets, world))
-            for world, sheets in keys
-        }
-        add_tables(report, grasps, "Grasps")
-    if asked.hours:
-        report.table("Hours of mixed use: force", hours_rows(asked.hands, asked.hours))
-    report.keep()
+        report = Report(
+            asked.quick,
+            hands=asked.hands,
+            touches_of_a_pad=asked.touches,
+            seeds=asked.seeds,
+            hours_of_mixed_use=asked.hours,
+        )
+        add_tables(report, {key: np.concatenate(made) for key, made in parts.items()}, "Touches")
+        report.table(
+            "Least errors",
+            [
+                least_row(
+                    f"{world}, {sheets}",
+                    np.concatenate(
+                        list(pool.map(least_errors, [(world, k, sheets) for k in range(asked.hands)]))
+                    ),
+                )
+                for world, sheets in keys
+            ],
+        )
+        if asked.seeds:
+            grasps = {
+                (world, sheets): np.concatenate(joined(pool, asked.objects, asked.seeds, sheets, world))
+                for world, sheets in keys
+            }
+            add_tables(report, grasps, "Grasps")
+        if asked.hours:
+            report.table("Hours of mixed use: force", hours_rows(pool, asked.hands, asked.hours))
+        report.keep()
 
 
-def hours_rows(hands: int, hours: float) -> list[dict[str, Any]]:
+def hours_rows(pool: Executor, hands: int, hours: float) -> list[dict[str, Any]]:
     """Return rows of the forces in mixed use."""
     rows = []
     for unknown, name in ((True, "radii unknown"), (False, "radii as stated")):
         for sheets in SHEETS:
             progress(f"hours, {sheets}, {name}")
-            found = [use_for_hours((number, hours, unknown, sheets)) for number in range(hands)]
+            found = list(
+                pool.map(use_for_hours, [(number, hours, unknown, sheets) for number in range(hands)])
+            )
             rows.append(score(f"{sheets}, {name}", np.concatenate(found), "force"))
     return rows
 
 
-def joined(objects: Sequence[str], seeds: int, sheets: str, world: str) -> list[FloatArray]:
+def joined(pool: Executor, objects: Sequence[str], seeds: int, sheets: str, world: str) -> list[FloatArray]:
     """Return the samples of all grasps of a world."""
     progress(f"grasps, {world}, {sheets}")
-    return [grasp_rows(name, seed, sheets, world) for seed in range(1, seeds + 1) for name in objects]
+    tasks = [(name, seed, sheets, world) for seed in range(1, seeds + 1) for name in objects]
+    return list(pool.map(grasp_rows, *zip(*tasks, strict=True)))
 
 
 if __name__ == "__main__":

@@ -112,13 +112,17 @@ def served(
     perceive: Literal[True] | Sequence[str] = (),
     duration_s: float = DURATION_S,
     done: GraspRecord | None = None,
+    used_before: bool = False,
 ) -> Served:
     """Let the first hand grasp and process the samples; its file describes sheets as their builder would.
 
     `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
-    `perceive` requests percepts, all or some kinds; `done` is the grasp if it has been simulated already.
+    `perceive` requests percepts, all or some kinds; `done` is the grasp if it has been simulated already;
+    `used_before`: the sheets are known to be rested, by a stored state.
     """
     deployment = world.describe(deployment)
+    if used_before:
+        deployment = with_rested_sheets(deployment)
     hand = deployment.hands[0]
     grasp = done or simulate_grasp(hand, name, seed, world, duration_s=duration_s)
     patches = contact_patches(grasp)
@@ -132,6 +136,8 @@ def served(
     counts = [virtual.all_counts(row, times_s) for row in range(len(hand.pads))]
     with zmq.Context() as context:
         run = _Run(deployment, context, grasp, world, perceive)
+        for pad in range(len(hand.pads) if used_before else 0):
+            run.pipeline.tick.sheet_force.set_back_force(pad, 0.0, 0.0)
         for tick, step in enumerate(steps.tolist()):
             run.tick(step, [of[tick] for of in counts])
         run.inputs.close()
@@ -139,6 +145,19 @@ def served(
     railed = sum(int((np.abs(of) >= 32767).any(axis=1).sum()) for of in counts)
     compared = _compared(deployment, grasp, patches, run, railed)
     return replace(compared, seed=seed, percepts_s=run.process.busy_s)
+
+
+def with_rested_sheets(deployment: Deployment) -> Deployment:
+    """Return a deployment that states its sheets as not loaded before."""
+    sheets = {
+        name: sheet.model_copy(
+            update={"behaviour": sheet.behaviour.model_copy(update={"back_force_std_n": 0.0})}
+        )
+        if sheet.behaviour
+        else sheet
+        for name, sheet in deployment.sheets.items()
+    }
+    return deployment.model_copy(update={"sheets": sheets})
 
 
 class _Run:
