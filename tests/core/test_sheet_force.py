@@ -20,6 +20,7 @@ from handtouch.core.sheet_force import (
     sheet_behaviour_of,
 )
 from handtouch.core.state import TickState
+from handtouch.daemon.law_report import LawReport
 
 FloatArray = NDArray[np.float64]
 PERIOD_NS, DT_S = 100_000_000, 0.1
@@ -233,6 +234,27 @@ def test_a_late_or_implausible_reference_is_ignored(force: float, late_ns: int) 
     reference = ForceReference(np.array([0]), np.array([force]), np.array([0.1]), rig.t_ns + late_ns)
     assert rig.compensation.update_gains(reference, np.full(1, rig.t_ns), rig.touching) == 0
     assert rig.compensation.log_gain[0] == 0.0
+
+
+@pytest.mark.parametrize(("ratio", "reported"), [(4.0, True), (1.3, False)])
+def test_contacts_whose_references_are_refused_report_another_law(ratio: float, reported: bool) -> None:
+    rig, load, report = Rig(1, calm(sheet.S1), sheet_behaviour_of(Behaviour())), np.array([2.0]), LawReport(1)
+    found = []
+    for _ in range(3):
+        for _ in range(4):  # several references of one contact count once
+            rig.run(1.5, load)
+            reference = ForceReference(np.array([0]), ratio * load, np.array([0.1]), rig.t_ns)
+            rig.compensation.update_gains(reference, np.full(1, rig.t_ns), rig.touching)
+        found.append(report.update(rig.compensation, 0, rig.t_ns))
+        rig.run(0.5, 0 * load)
+    assert found[:2] == [None, None]
+    assert (found[2] is not None) is reported
+    if found[2] is None:
+        return
+    assert found[2].kind == "sheet_replaced"
+    assert "of 3 contacts in succession" in found[2].evidence
+    rig.compensation.reset_evidence(0)
+    assert report.update(rig.compensation, 0, rig.t_ns) is None
 
 
 def test_sheets_of_two_behaviours_and_none_are_independent() -> None:

@@ -148,6 +148,10 @@ class SheetForceCompensation:
             held.touched_s,
         )
         self.log_gain, self.log_gain_std = held.log_gain, held.log_gain_std
+        self.refused_contacts, self._refused_in = np.zeros((2, len(behaviours)), np.int64)
+        """(n,) contacts in succession whose force references were all refused"""
+        self.refused_log_ratio = np.zeros(len(behaviours))
+        """(n,) ln of the last such reference over the force"""
         self._first_gain_std = np.array([0.0 if b is None else b.gain_std for b in behaviours])
         self._last_touch_ns, self._compared_ns = held.last_touch_ns, held.compared_ns
         self._confirmed, self._begin_s = held.force_confirmed, held.touched_at_begin_s
@@ -241,6 +245,7 @@ class SheetForceCompensation:
     def reset_evidence(self, pad: int, *, new_sheet: bool = False) -> None:
         """Restart the evidence: the pad has another calibration, and perhaps another sheet."""
         self.contacts[pad], self.touched_s[pad], self._begin_s[pad] = 0, 0.0, 0.0
+        self.refused_contacts[pad] = self._refused_in[pad] = 0
         self._confirmed[pad] = False
         self.log_gain[pad], self._gain[pad] = 0.0, 1.0
         self.log_gain_std[pad] = self._first_gain_std[pad]
@@ -317,6 +322,8 @@ class SheetForceCompensation:
         since_s = np.minimum(since_s, _HOUR_S)
         spread = spread + np.square(_LOG_GAIN_STD_PER_HOUR) * since_s / _HOUR_S
         used = np.isfinite(excess) & (np.square(excess) <= _OUTLIER_SIGMA**2 * (spread + noise))
+        refused = np.isfinite(excess) & ~used
+        self._count_refused(pads[used], pads[refused], excess[refused])
         pads, excess, since_s = pads[used], excess[used], since_s[used]
         spread, noise = spread[used], noise[used]
         gain = spread / (spread + noise)
@@ -329,6 +336,14 @@ class SheetForceCompensation:
         self._compared_ns[pads] = reference.measured_ns
         self._confirmed[pads] = True
         return len(pads)
+
+    def _count_refused(self, used: IntArray, refused: IntArray, log_ratio: FloatArray) -> None:
+        """Count contacts whose references are refused, and note the last of their ratios to the force."""
+        self.refused_contacts[used] = 0
+        new = refused[self._refused_in[refused] != self.contacts[refused]]
+        self.refused_contacts[new] += 1
+        self._refused_in[new] = self.contacts[new]
+        self.refused_log_ratio[refused] = log_ratio
 
     def _make_stage(self) -> SheetStage:
         pads = np.array([pad for group in self.groups for pad in group.pads.tolist()], np.int64)

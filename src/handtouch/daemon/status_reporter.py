@@ -27,6 +27,7 @@ from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.stages.rows import SHEAR_CHANNELS
+from handtouch.daemon.law_report import LawReport
 from handtouch.daemon.noise_report import NoiseReport
 from handtouch.daemon.pad_explanation import explain_pad_state
 from handtouch.daemon.percept_client import PerceptClient
@@ -149,7 +150,7 @@ class StatusReporter:
         self._shear_channels = ShearChannels()
         self._second_sheet: dict[int, SecondSheetStatusName] = {}
         """status of pads' second sheets under the last touch"""
-        self._noise = NoiseReport(len(self._pads))
+        self._noise, self._law = NoiseReport(len(self._pads)), LawReport(len(self._pads))
         self._tick_durations_ns: list[int] = []
         self._tick_us: dict[str, float] = {}
         self._logged_problems = dict.fromkeys(buses.ports, "")  # last problem of each bus, without digits
@@ -364,8 +365,10 @@ class StatusReporter:
         counts = self._pipeline.tick.counts[pad]
         assessment = self.supervisor.health_fields(pad) if self.supervisor is not None else {}
         noise = self._noise.update(self._pipeline.tick, pad, settings.node, now_ns, noisy=columns.noisy[pad])
-        if noise is not None:
-            assessment["diagnoses"] = (*assessment.get("diagnoses", ()), noise.to_map())
+        law = self._law.update(self._pipeline.tick.sheet_force, pad, now_ns)
+        found = tuple(one.to_map() for one in (noise, law) if one is not None)
+        if found:
+            assessment["diagnoses"] = (*assessment.get("diagnoses", ()), *found)
         return wire.Health(
             v=wire.SCHEMA_VERSION,
             session=self._publisher.session,
