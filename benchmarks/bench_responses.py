@@ -17,10 +17,10 @@ presses are round.
 
 *Beyond the taxels*: the same barometers on a pad of 16 mm, which reaches 3 mm beyond the outermost ones.
 
-*Zeros that move* (`ARGS="--part zeros"`): an hour of each finger at 100 Hz in `default`, all pads of
-taxels.toml at once. *Drifting*: each channel's zero by the signal of 0.5 N and its gain by 10 %, up in one
-hour, touches of 0.2 N every 30 s. *Turning*: magnetic ones, by 20 degrees in a second every 15 s, which
-shifts channels by the signal of up to 0.1 N; 0.2 N at rest, 0.3 N in the second after a turn.
+*Zeros that move* (`ARGS="--part drifting"`, `"--part turning"`): an hour of each finger at 100 Hz in
+`default`, both pads of taxels.toml. *Drifting*: each channel's zero by the signal of 0.5 N and its gain by 10
+%, up in one hour, touches of 0.2 N every 30 s. *Turning*: magnetic ones, by 20 degrees in a second every 15
+s, which shifts channels by the signal of up to 0.1 N; 0.2 N at rest, 0.3 N in the second after a turn.
 
 *Tick* (`ARGS="--part tick"`): 15 pads of nine cells by turns with 15 of four electrodes in one process, all
 touched by contacts that slide, or none; processor time of a tick and of the preparation of the next.
@@ -32,7 +32,9 @@ import os
 import tempfile
 import time
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +75,7 @@ from handtouch.simulate.worlds.spreads import ContactSpread
 ERRORS = {"position": position_error, "force": force_error}
 PRESSES, PRESS_FORCES_N, PRESS_STD_MM, PRESS_SAMPLES = 60, (0.5, 2.0), 0.1, 15
 FIRST = 3  # touch that is sampled: zeros are known by then
-MOVING = {"drifting": Zeros(drift_n=0.5, gain_drift=0.1), "turning, magnetic": Zeros(turn_n=0.1)}
+MOVING = {"drifting": Zeros(drift_n=0.5, gain_drift=0.1), "turning": Zeros(turn_n=0.1)}
 PADS, WARM_UP, MAX_TICK_RATIO = 15, 20, 2.5
 SLIDING_STEP = 0.005  # of a contact in a tick, over the pad's sides
 
@@ -240,21 +242,17 @@ def measure_ticks(asked: Namespace) -> None:
     report.keep()
 
 
-def measure_zeros(asked: Namespace) -> None:
-    """Measure false contacts, and light touches, while zeros move."""
+def measure_zeros(name: str, asked: Namespace) -> None:
+    """Measure false contacts, and light touches, while zeros move in one way of `MOVING`."""
     fingers, hours = (1, 0.1) if asked.quick else (asked.moving, 1.0)
-    report = Report(asked.quick, "zeros", fingers=fingers, hours_of_a_finger=hours)
-    rows = []
-    for name, zeros in MOVING.items():
-        found = Found()
-        for number in range(fingers):
-            found.add(play_zeros(zeros, number, hours))
-            progress(f"{name}: {number + 1} of {fingers}")
-        rows.append({"zeros": name, "hours": found.hours, "false an hour": Rate(found.false, found.hours)})
-        for force, count in found.touches.items():
-            rows[-1][f"{force} found, %"] = Share(found.found[force], count)
-        report.limit(f"{name}: false contacts", found.false, 0)
-    report.table("Zeros that move", [{**dict.fromkeys(rows[-1]), **row} for row in rows])
+    report, found = Report(asked.quick, name, fingers=fingers, hours_of_a_finger=hours), Found()
+    for number in range(fingers):
+        found.add(play_zeros(MOVING[name], number, hours))
+        progress(f"{name}: {number + 1} of {fingers}")
+    shares = {f"{force} found, %": Share(found.found[force], count) for force, count in found.touches.items()}
+    row = {"hours": found.hours, "false contacts": found.false, "an hour": Rate(found.false, found.hours)}
+    report.table(f"Zeros that move: {name}", [row | shares])
+    report.limit(f"{name}: false contacts", found.false, 0)
     report.keep()
 
 
@@ -293,10 +291,10 @@ def measure_presses(asked: Namespace) -> None:
     report.keep()
 
 
-PARTS = {
+PARTS: dict[str, Callable[[Namespace], None]] = {
     "intervals": measure_intervals,
     "measured": measure_presses,
-    "zeros": measure_zeros,
+    **{name: partial(measure_zeros, name) for name in MOVING},
     "tick": measure_ticks,
 }
 

@@ -30,7 +30,7 @@ class TwoLayers(ChannelMap):
 
     ohm_per_square: of each film. lead_ohm: of the four electrodes, to their amplifiers. lead_std_ohm: their
     standard deviation; unevenness_std: that of the logarithm of a film's resistance from one end to the
-    middle.
+    middle, and of shorter waves of it, each film's own.
     """
 
     def __init__(
@@ -55,16 +55,21 @@ class TwoLayers(ChannelMap):
         return _pairs(*self._shares(x, y))
 
     def variation_slopes(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
-        """Return changes by each lead, and by films whose resistance varies along the current."""
+        """Return changes of each film: by what both leads shift alike, and by all else.
+
+        With l the deviation of a lead over the film's resistance, both leads have the variance l^2 ((1 - s)^2
+        + s^2) of a share s, of which l^2 / 2 is the same all over.
+        """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-        shares, none = self._shares(x, y), np.zeros_like(x)
+        along, sides, none = (x / self.a, y / self.b), (self.a, self.b), np.zeros_like(x)
         found = np.zeros((VARIATIONS, self.channels, *x.shape))
-        for number in range(4):
-            film, end = divmod(number, 2)
-            change = self._lead_std_ohm * self._per_ohm[film] * (1 - end - shares[film])
-            found[number] = _pairs(*(change if k == film else none for k in range(2)), change=True)
-        bends = [np.sin(np.pi * at / side) / np.pi for at, side in ((x, self.a), (y, self.b))]
-        found[4] = self._unevenness_std * _pairs(*bends, change=True)
+        for film, share in enumerate(self._shares(x, y)):
+            by_lead = self._lead_std_ohm * self._per_ohm[film]
+            waves = _wave_variance(along[film], along[1 - film], sides[film] / sides[1 - film])
+            varying = np.sqrt(2 * (by_lead * (share - 0.5)) ** 2 + self._unevenness_std**2 * waves)
+            for number, change in enumerate((none + by_lead / math.sqrt(2), varying)):
+                of_films = (change, none) if film == 0 else (none, change)
+                found[2 * film + number] = _pairs(*of_films, change=True)
         return found
 
     def spreading_radius(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
@@ -83,6 +88,18 @@ def _pairs(of_xa: FloatArray, of_yb: FloatArray, *, change: bool = False) -> Flo
     """Return the signals (4, ...) of which those of both electrodes of a film sum to 1, or changes, to 0."""
     whole = 0.0 if change else 1.0
     return np.stack([whole - of_xa, of_xa, whole - of_yb, of_yb])
+
+
+def _wave_variance(s: FloatArray, t: FloatArray, ratio: float) -> FloatArray:
+    """Return the variance of a share by waves of the film's resistance, each of unit amplitude, as those of a
+    sheet; s: along the current, t: across, fractions of the sides of this ratio.
+
+    By cos(pi i s) cos(pi j t) it changes by i sin(pi i s) cos(pi j t) / (pi (i^2 + (ratio j)^2)), to first
+    order; waves across the current alone change nothing.
+    """
+    first, second = np.sin(np.pi * s) / np.pi, np.sin(2 * np.pi * s) / (2 * np.pi)
+    across = np.cos(np.pi * t) / (1 + ratio**2)
+    return np.asarray(first**2 * (1 + across**2) + second**2)
 
 
 def _strip_radius(x: FloatArray, y: FloatArray, a: float, b: float) -> FloatArray:
