@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -229,8 +230,9 @@ def test_electrodes_anywhere_above_a_shear_pad_are_not_written() -> None:
 
 
 def test_design_command_writes_tables_of_six_electrodes_that_the_daemon_accepts(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("handtouch.design.optimise.optimise_layout", partial(optimise_layout, starts=1))
     command = ["design", str(flat_file(tmp_path, PLANE)), "--link", "tip", "--goal", "position"]
     assert main([*command, "--electrodes", "6", "--world", "ideal", "--json", "-o", str(tmp_path)]) == 0
     report = json.loads(capsys.readouterr().out)
