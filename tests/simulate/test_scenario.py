@@ -99,6 +99,7 @@ GUM = '[[fault]]\nkind = "gum"\nlink = "a"\nfrom_s = 3.0\nplace = [0.5, 0.5]\n'
         (GOOD.replace("[[0.5, 0.5]]", "[[0.5, 1.0]]"), ['[[touch]] 1 "a": path[0][1] = 1.0', "0.98"]),
         (GOOD.replace("[1.0]", "[]"), ["force_n = []"]),
         (GOOD.replace("duration_s = 1.0\n", ""), ["duration_s", "is missing"]),
+        (GOOD + "hertz_force_n = 2.0", ['[[touch]] 1 "a"', "hertz_force_n = 2 needs radius_mm"]),
         (GOOD + GUM.replace("gum", "chewing_gum"), ['[[fault]] 1 "a".kind = "chewing_gum"', '"moisture"']),
         (GOOD + GUM + "force = 1.0\n", ['[[fault]] 1 "a": force', "force_n"]),
         (GOOD + GUM.replace("0.5, 0.5", "0.5, 1.5"), ['[[fault]] 1 "a": place[1] = 1.5', "0.98"]),

@@ -10,11 +10,11 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from handtouch.config.base import Name, Positive, Table
 from handtouch.simulate.contact_patch import ContactPatch, Profile, discs
@@ -64,6 +64,15 @@ class ScenarioTouch(Table):
         None,
         description="from x on the pad to the patch's length and rise of pressure; left out: the world's",
     )
+
+    @model_validator(mode="after")
+    def _check_patch(self) -> Self:
+        if self.hertz_force_n is not None and self.radius_mm is None:
+            raise ValueError(
+                f"hertz_force_n = {self.hertz_force_n:g} needs radius_mm, the radius at that force; "
+                "state radius_mm, or leave hertz_force_n out"
+            )
+        return self
 
     def patch(self, drawn: ContactPatch) -> ContactPatch:
         """Return the touch's patch; `drawn`: the world's, for what it leaves out."""
