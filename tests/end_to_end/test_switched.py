@@ -122,8 +122,11 @@ def test_a_contact_is_located_from_both_states_in_every_cycle(served: Served) ->
     assert max(off_mm(contact, (0.3, 0.35)) for contact in valid) < 0.5
     assert np.median([off_mm(contact, (0.3, 0.35)) for contact in valid]) < 0.1
     assert len({contact.t_ns for contact in found}) == len(found)
-    steps_ms = np.diff([contact.t_ns for contact in found]) * 1e-6
-    assert np.median(steps_ms) == pytest.approx(20.0, abs=5.0)
+
+    def step_ms() -> float:
+        return float(np.median(np.diff([contact.t_ns for contact in served.updates(50)]))) * 1e-6
+
+    served.wait("in every cycle", lambda: 15 < step_ms() < 25)  # a busy machine is slower for a while
 
 
 def test_two_contacts_are_published_as_parts(served: Served) -> None:

@@ -771,7 +771,7 @@ def test_guided_calibration_with_a_daemon_corrects_forces_and_is_stored(
     answer = json.loads(output.out)
     assert answer["force_error_before"] > 2 * answer["force_error_after"]
     assert answer["calibration_id"] == "4711-1"
-    now = client.request("calibrate", endpoint=endpoints[1], pad="plane")
+    now = client.request("calibrate", endpoint=endpoints[1], timeout_s=20, pad="plane")
     assert now["calibration_id"] == "4711-1"
     assert now["law"]["alpha"] == answer["law"]["alpha"]
     assert len(record.read_recording(log)[1]) == 8
@@ -783,6 +783,6 @@ def test_guided_calibration_with_a_daemon_corrects_forces_and_is_stored(
 
 def _until_delivering(control: str) -> None:
     end_s = time.monotonic() + 20
-    while client.request("status", endpoint=control)["pads"][0]["node_state"] != "operational":
+    while client.request("status", endpoint=control, timeout_s=20)["pads"][0]["node_state"] != "operational":
         assert time.monotonic() < end_s
         time.sleep(0.05)
