@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,9 +11,12 @@ from numpy.typing import NDArray
 from handtouch.config import Deployment, parse
 from handtouch.config.channels import node_channels
 from handtouch.supervisor.diagnose import DiagnosisModel, HandDiagnostics, HandSamples, PadDiagnosis
+from handtouch.supervisor.diagnose.hypotheses import HypothesisTables
 from handtouch.wire.faults import FaultKind
 from tests.deployments import deployment_text, pad_text
 
+_TABLES: dict[Hashable, HypothesisTables] = {}
+"""Of the one pad of all deployments"""
 INTEGERS = [f"{sign}{bits}" for sign in "iu" for bits in (8, 16, 24, 32)]
 
 
@@ -24,7 +29,7 @@ def deployment(kind: str, **keys: float) -> Deployment:
 
 def diagnose(made: Deployment, counts: NDArray[np.int64]) -> list[PadDiagnosis]:
     """Return what is diagnosed in 60 s of counts (6000, 4) at 100 Hz."""
-    diagnosis, changes = HandDiagnostics(DiagnosisModel.from_deployment(made, "h")), []
+    diagnosis, changes = HandDiagnostics(DiagnosisModel.from_deployment(made, "h"), tables=_TABLES), []
     stamps = (1 + np.arange(len(counts), dtype=np.int64))[:, None] * 10_000_000
     for first in range(0, len(counts), 50):
         rows = slice(first, first + 50)
