@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -115,11 +116,11 @@ PRESSES = [(x, y) for y in (0.15, 0.85) for x in (0.12, 0.4, 0.65, 0.88)]
 
 
 def press_scenario(quiet_s: float) -> str:
-    """Return presses of a finger, of which the zero before each is known."""
+    """Return presses of a pad, of which the zero before each is known."""
     return "".join(
         f"""
 [[touch]]
-link = "index_distal"
+link = "palm_heel"
 from_s = {quiet_s + 1.3 * number:.2f}
 duration_s = 0.75
 path = [[{x}, {y}]]
@@ -129,13 +130,13 @@ force_n = [1.0]
     )
 
 
-def test_presses_of_a_finger_become_its_map_guided_and_from_the_recording(rig: Any) -> None:
-    surface = find_pad(load(rig.config), "index_distal").pad.surface.build()
+def test_presses_of_a_pad_become_its_map_guided_and_from_the_recording(rig: Any) -> None:
+    surface = find_pad(load(rig.config), "palm_heel").pad.surface.build()
     places_mm = 1e3 * np.array(PRESSES) * surface.extent_m
     table = rig.folder / "places.csv"
     table.write_text("x_mm,y_mm\n" + "".join(f"{x:.3f},{y:.3f}\n" for x, y in places_mm))
     rig.scenario.write_text(press_scenario(quiet_s=1.2))
-    command = ["calibrate", "index_distal", "--config", str(rig.config), "--positions", str(table), "--map"]
+    command = ["calibrate", "palm_heel", "--config", str(rig.config), "--positions", str(table), "--map"]
     files = {name: rig.folder / f"{name}.npz" for name in ("guided", "recorded")}
     rig.start("run")
     with rig.recording() as recording:
@@ -146,8 +147,11 @@ def test_presses_of_a_finger_become_its_map_guided_and_from_the_recording(rig: A
     assert rig.printed("calibrate").count("] press at (") == len(PRESSES)
     status, printed = rig.call(*command, str(files["recorded"]), "--from", str(recording))
     assert status == 0, printed
-    assert "what is stated" in printed
-    assert 'press_map = "recorded.npz" in the [[hand.pad]] of right/index_distal' in printed
+    error_mm = re.search(r"what is stated +([\d.]+) mm", printed)
+    assert error_mm is not None
+    assert float(error_mm[1]) < 1.0
+    assert "Far from the map" not in printed
+    assert 'press_map = "recorded.npz" in the [[hand.pad]] of right/palm_heel' in printed
     presses = [PressTable(file.read_bytes()) for file in files.values()]
     np.testing.assert_allclose(presses[0].signals, presses[1].signals, rtol=0.02)
     np.testing.assert_allclose(1e3 * presses[0].place_m, places_mm, atol=1.0)
