@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Sequence
+from argparse import Namespace
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -302,72 +302,72 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--hands", type=int, default=4, help="of each world")
     parser.add_argument("--touches", type=int, default=10, help="of each pad")
-    parser.add_argument("--seeds", type=int, default=2, help="of each grasp; 0: no grasps")
-    parser.add_argument("--hours", type=float, default=12.0, help="of mixed use; 0: none")
+    parser.add_argument("--seeds", type=int, default=2, help="of each grasp")
+    parser.add_argument("--hours", type=float, default=12.0, help="of mixed use")
     parser.add_argument("--objects", nargs="+", default=list(GRASP_OBJECTS), choices=list(GRASP_OBJECTS))
+    parser.add_argument("--only", nargs="+", default=list(PARTS), choices=list(PARTS))
     asked = parser.parse_args()
     if asked.quick:
         asked.hands, asked.touches, asked.seeds, asked.objects = 1, 2, 1, asked.objects[:1]
         asked.hours = min(asked.hours, 0.2)
-    keys = [(world, sheets) for world in NAMED for sheets in SHEETS]
+    with ProcessPoolExecutor(os.cpu_count() or 1) as pool:
+        for name in asked.only:
+            PARTS[name](pool, asked)
+
+
+def report_touches(pool: Executor, asked: Namespace) -> None:
+    """Measure touches, and the least errors of their hands."""
     tasks = [
-        (world, number, asked.touches, sheets) for world, sheets in keys for number in range(asked.hands)
+        (world, number, asked.touches, sheets) for world, sheets in KEYS for number in range(asked.hands)
     ]
     parts: dict[tuple[str, str], list[FloatArray]] = {(world, case): [] for world in NAMED for case in CASES}
-    with ProcessPoolExecutor(os.cpu_count() or 1) as pool:
-        for task, tables in zip(tasks, pool.map(play, tasks), strict=True):
-            for case, rows in zip([case for case in CASES if case.startswith(task[3])], tables, strict=True):
-                parts[task[0], case].append(rows)
-            progress(f"{task[0]}, {task[3]}: hand {task[1] + 1}")
-        report = Report(
-            asked.quick,
-            hands=asked.hands,
-            touches_of_a_pad=asked.touches,
-            seeds=asked.seeds,
-            hours_of_mixed_use=asked.hours,
-        )
-        add_tables(report, {key: np.concatenate(made) for key, made in parts.items()}, "Touches")
-        report.table(
-            "Least errors",
-            [
-                least_row(
-                    f"{world}, {sheets}",
-                    np.concatenate(
-                        list(pool.map(least_errors, [(world, k, sheets) for k in range(asked.hands)]))
-                    ),
-                )
-                for world, sheets in keys
-            ],
-        )
-        if asked.seeds:
-            grasps = {
-                (world, sheets): np.concatenate(joined(pool, asked.objects, asked.seeds, sheets, world))
-                for world, sheets in keys
-            }
-            add_tables(report, grasps, "Grasps")
-        if asked.hours:
-            report.table("Hours of mixed use: force", hours_rows(pool, asked.hands, asked.hours))
-        report.keep()
+    for task, tables in zip(tasks, pool.map(play, tasks), strict=True):
+        for case, rows in zip([case for case in CASES if case.startswith(task[3])], tables, strict=True):
+            parts[task[0], case].append(rows)
+        progress(f"{task[0]}, {task[3]}: hand {task[1] + 1}")
+    report = Report(asked.quick, part="touches", hands=asked.hands, touches_of_a_pad=asked.touches)
+    add_tables(report, {key: np.concatenate(made) for key, made in parts.items()}, "Touches")
+    report.table(
+        "Least errors",
+        [
+            least_row(
+                f"{world}, {sheets}",
+                np.concatenate([least_errors((world, number, sheets)) for number in range(asked.hands)]),
+            )
+            for world, sheets in KEYS
+        ],
+    )
+    report.keep()
 
 
-def hours_rows(pool: Executor, hands: int, hours: float) -> list[dict[str, Any]]:
-    """Return rows of the forces in mixed use."""
+def report_grasps(pool: Executor, asked: Namespace) -> None:
+    """Measure MuJoCo's grasps."""
+    grasps = {}
+    for world, sheets in KEYS:
+        tasks = [(name, seed, sheets, world) for seed in range(1, asked.seeds + 1) for name in asked.objects]
+        grasps[world, sheets] = np.concatenate(list(pool.map(grasp_rows, *zip(*tasks, strict=True))))
+        progress(f"grasps, {world}, {sheets}")
+    report = Report(asked.quick, part="grasps", seeds=asked.seeds, objects=", ".join(asked.objects))
+    add_tables(report, grasps, "Grasps")
+    report.keep()
+
+
+def report_hours(pool: Executor, asked: Namespace) -> None:
+    """Measure hours of mixed use."""
     rows = []
     for unknown, name in ((True, "radii unknown"), (False, "radii as stated")):
         for sheets in SHEETS:
+            tasks = [(number, asked.hours, unknown, sheets) for number in range(asked.hands)]
+            found = np.concatenate(list(pool.map(use_for_hours, tasks)))
+            rows.append(score(f"{sheets}, {name}", found, "force"))
             progress(f"hours, {sheets}, {name}")
-            found = list(
-                pool.map(use_for_hours, [(number, hours, unknown, sheets) for number in range(hands)])
-            )
-            rows.append(score(f"{sheets}, {name}", np.concatenate(found), "force"))
-    return rows
+    report = Report(asked.quick, part="hours", hands=asked.hands, hours_of_each=asked.hours)
+    report.table("Hours of mixed use: force", rows)
+    report.keep()
 
 
-def joined(pool: Executor, objects: Sequence[str], seeds: int, sheets: str, world: str) -> list[FloatArray]:
-    """Return the samples of all grasps of a world."""
-    progress(f"grasps, {world}, {sheets}")
-    tasks = [(name, seed, sheets, world) for seed in range(1, seeds + 1) for name in objects]
-    return list(pool.map(grasp_rows, *zip(*tasks, strict=True)))
+PARTS = {"touches": report_touches, "grasps": report_grasps, "hours": report_hours}
+KEYS = [(world, sheets) for world in NAMED for sheets in SHEETS]
 
 
 if __name__ == "__main__":
