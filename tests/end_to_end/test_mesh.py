@@ -1,4 +1,4 @@
-"""A fingertip on the triangles of an STL file: a subscriber sees contacts where the simulator pressed."""
+"""A fingertip of an STL file under a measured film: a subscriber sees contacts where it was pressed."""
 
 from __future__ import annotations
 
@@ -40,15 +40,24 @@ def pressed(rig: Any) -> Any:
     text = shipped.path("fingertip.toml").read_text()
     text = text.replace("[daemon]\n", f"[daemon]\n{settings}\nsupervise = false\n", 1)
     text = text.replace("sync_period_ms = 10.0", "sync_period_ms = 20.0", 1)
-    rig.config.write_text(text.replace("noise_counts", "heartbeat_timeout_ms = 1000\nnoise_counts", 1))
-    (rig.config.parent / "fingertip.stl").write_bytes(shipped.path("fingertip.stl").read_bytes())
+    text = text.replace("noise_counts", "heartbeat_timeout_ms = 1000\nnoise_counts", 1)
+    rig.config.write_text(
+        text.replace('link = "index_tip"\n', 'link = "index_tip"\nresistance_map = "film.npz"\n', 1)
+    )
+    stl = shipped.path("fingertip.stl").read_bytes()
+    (rig.config.parent / "fingertip.stl").write_bytes(stl)
+    # its resistance rises by 50 % from end to end: without the map contacts are off by up to 0.5 mm
+    places = parse_stl(stl).points[::5]
+    along = (places[:, 0] - places[:, 0].min()) / np.ptp(places[:, 0])
+    columns = dict(zip(("x_mm", "y_mm", "z_mm"), places.T, strict=True))
+    np.savez(rig.config.parent / "film.npz", ohm_per_square=2000 * (0.8 + 0.4 * along), **columns)
     rig.scenario.write_text(PRESSED)
     rig.simulate("--world", "ideal", "--truth", str(rig.folder / "truth"))
     rig.start("run")
     return rig
 
 
-def test_contacts_on_a_mesh_are_where_it_was_pressed(pressed: Any) -> None:
+def test_contacts_on_a_mesh_with_a_measured_film_are_where_it_was_pressed(pressed: Any) -> None:
     contacts: list[wire.Contact] = []
     with pressed.subscribe("contact/*/*") as messages:
         while len(contacts) < MIN_SAMPLES:
