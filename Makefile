@@ -118,9 +118,9 @@ tables: $(VENV)/.dev ## write from the code what is generated of messages (docs/
 wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
-# three workers for two processors: tests of processes wait for a third of their time
+# two workers for two processors: a third saves five minutes, but starves simulated nodes now and then
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
-	$(BIN)/python -m pytest -m "not socketcan" -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 	@rm -rf build/tests/handtouch # tables of earlier sessions would leave the code that computes them idle
