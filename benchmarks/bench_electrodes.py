@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -135,6 +135,19 @@ def rectangle_deployment(counts: Sequence[int]) -> Deployment:
     return parse("".join(text))
 
 
+def estimates_without_oracle(
+    found: Sequence[tuple[wire.Contact | None, GroundTruth]], columns: Mapping[str, NDArray[Any]]
+) -> dict[str, Estimates]:
+    """Return estimates of position, with its bound, and force of touches (n,) by quantity."""
+    bound_m, made = np.array([truth.bound_m for _, truth in found]), {}
+    for quantity, error in ERRORS.items():
+        errors = [error(*pair) for pair in found]
+        unknown = np.full((len(found), len(errors[0][0]), len(errors[0][0])), np.nan)
+        bound = bound_m if quantity == "position" else np.full(len(found), np.nan)
+        made[quantity] = estimates(errors, bound, unknown, columns)
+    return made
+
+
 def play_many(number: int, touches: int, counts: Sequence[int]) -> Estimates:
     """Return estimates of the position on rectangles with many electrodes, in each state."""
     drawn = replace(WORLDS["default"], mounts=MountSpread()).draw(Family.REPORTING.seed(number))
@@ -178,12 +191,8 @@ def play(world: str, number: int, touches: int) -> Played:
             "force": bin_labels(true_n, (0.5, 2.0, 5.0), "N"),
             "finger": np.full(len(found), number),
         }
-        bound_m = np.array([truth.bound_m for _, truth in found])
-        for quantity, error in ERRORS.items():
-            errors = [error(*pair) for pair in found]
-            unknown = np.full((len(found), len(errors[0][0]), len(errors[0][0])), np.nan)
-            bound = bound_m if quantity == "position" else np.full(len(found), np.nan)
-            parts[quantity].append(estimates(errors, bound, unknown, columns))
+        for quantity, own in estimates_without_oracle(found, columns).items():
+            parts[quantity].append(own)
     pairs = [bool(contact.parts) for (_, link), contact in contacts.items() if link == PAIRED]
     return Played({quantity: concatenate(some) for quantity, some in parts.items()}, pairs)
 

@@ -42,7 +42,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from benchmarks.bench_electrodes import share_of
+from benchmarks.bench_electrodes import ERRORS, estimates_without_oracle, share_of
 from benchmarks.bench_worlds import UNITS
 from benchmarks.hand_touches import (
     FORCES_N,
@@ -52,7 +52,6 @@ from benchmarks.hand_touches import (
     TouchReadings,
     draw_touches,
     estimates,
-    force_error,
     position_error,
 )
 from benchmarks.page import Report, options, progress
@@ -72,7 +71,6 @@ from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family, MountSpread, World
 from handtouch.simulate.worlds.spreads import ContactSpread
 
-ERRORS = {"position": position_error, "force": force_error}
 PRESSES, PRESS_FORCES_N, PRESS_STD_MM, PRESS_SAMPLES = 60, (0.5, 2.0), 0.1, 15
 FIRST = 3  # touch that is sampled: zeros are known by then
 MOVING = {"drifting": Zeros(drift_n=0.5, gain_drift=0.1), "turning": Zeros(turn_n=0.1)}
@@ -101,12 +99,8 @@ def play(deployment: Deployment, world: str, number: int, touches: int) -> dict[
             "pad": np.full(len(found), f"{link}, {model.electrode_counts[row]} channels"),
             "finger": np.full(len(found), number),
         }
-        bound_m = np.array([truth.bound_m for _, truth in found])
-        for quantity, error in ERRORS.items():
-            errors = [error(*pair) for pair in found]
-            unknown = np.full((len(found), len(errors[0][0]), len(errors[0][0])), np.nan)
-            bound = bound_m if quantity == "position" else np.full(len(found), np.nan)
-            parts[quantity].append(estimates(errors, bound, unknown, columns))
+        for quantity, own in estimates_without_oracle(found, columns).items():
+            parts[quantity].append(own)
     return {quantity: concatenate(some) for quantity, some in parts.items()}
 
 
