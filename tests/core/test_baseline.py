@@ -167,6 +167,16 @@ def test_one_odd_pad_does_not_move_the_common_drift() -> None:
     assert rig.total(0) == pytest.approx(4 * 0.05 * (60 - 10), rel=0.15)
 
 
+def test_drift_that_all_pads_share_is_no_speed_of_their_own() -> None:
+    speeds = {}
+    for others in (0.05, 0.0):
+        rig = Rig(pads=5, period_ns=40_000_000)
+        rig.run(300.0, lambda t, others=others: only(0, 0.05 * t, others=others * t, pads=5))  # type: ignore[misc]
+        speeds[others] = float(rig.baseline.drift_speed[0])
+    assert speeds[0.0] > 0.1  # 0.2 counts a second of its own, half learned after five measurements
+    assert speeds[0.05] < 0.03
+
+
 def test_a_released_pad_is_held_until_it_is_nearly_back() -> None:
     rig = Rig(period_ns=20_000_000)
     rig.run(2.0, lambda _: 0.0)

@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from handtouch.field import Rectangle
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.residual import point_test, resolvable_separation
+from handtouch.field.residual import point_test
 
 SQUARE = Rectangle(1.0, 1.0)
 
@@ -61,22 +61,6 @@ def test_residual_scatters_as_predicted() -> None:
     seen = point_test(SQUARE, currents, levels, found=found)
     assert found.residual.std() == pytest.approx(seen.residual_std.mean(), rel=0.03)
     assert seen.score == pytest.approx(np.sign(found.residual) * np.sqrt(found.chi_squared), abs=0.05)
-
-
-def test_contacts_at_the_resolvable_separation_are_distinguished() -> None:
-    noise, place = 1e-3, (0.45, 0.6)
-    distance = float(resolvable_separation(SQUARE, *place, noise, false_alarm=1e-2, detection=0.9))
-    x = [place[0] - distance / 2, place[0] + distance / 2]
-    pair = SQUARE.side_fractions(x, [place[1]] * 2).mean(axis=1)
-    currents = pair[:, None] + noise * np.random.default_rng(13).normal(size=(4, 4000))
-    detected = ~point_test(SQUARE, currents, noise, false_alarm=1e-2).is_point
-    assert detected.mean() == pytest.approx(0.9, abs=0.02)
-
-
-def test_separation_grows_as_the_fourth_root_of_variance() -> None:
-    quiet, loud = (float(resolvable_separation(SQUARE, 0.5, 0.5, noise)) for noise in (1e-6, 1e-4))
-    assert loud / quiet == pytest.approx(10, rel=0.01)
-    assert resolvable_separation(SQUARE, [0.01, 0.5], [0.5, 0.5], 1e-2).tolist()[0] == math.inf
 
 
 def test_invalid_arguments_are_named() -> None:

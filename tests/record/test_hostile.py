@@ -268,6 +268,14 @@ def test_a_payload_of_any_form_is_an_error_without_traceback(
         assert "errors.pydantic.dev" not in said
 
 
+@pytest.mark.parametrize("error", [KeyError, TypeError, AttributeError, ZeroDivisionError, struct.error])
+def test_what_a_reader_raises_for_a_payload_names_the_file(error: type[Exception], tmp_path: Path) -> None:
+    file = tmp_path / "some.mcap"
+    file.write_bytes(MAGIC)
+    with pytest.raises(ValueError, match=rf"some\.mcap: .*{error.__name__}"), Recording(file).checked():
+        raise error("n")
+
+
 def test_a_replay_goes_on_without_differences_after_a_loss_between_contacts_and_their_tick(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,7 +18,6 @@ from handtouch.sheet import (
     ParameterUncertainty,
     PrandtlIshlinskii,
     SheetCompensator,
-    SheetHistory,
     SheetModel,
     TemperatureResponse,
 )
@@ -188,38 +187,3 @@ def test_a_negative_interval_is_rejected() -> None:
 def test_a_negative_load_is_rejected() -> None:
     with pytest.raises(ValueError, match="loads"):
         S1.discretise(0.1).forward(S1.initial_state(2), [1.0, -1.0])
-
-
-class TestHistory:
-    """History of a sheet as a function of time."""
-
-    @staticmethod
-    def history(step_s: float = 0.01) -> SheetHistory:
-        return SheetHistory(S1, 2, lambda t: [2.0 * (t % 2 > 1), 1.0 + np.sin(t)], seed=8, step_s=step_s)
-
-    @given(st.lists(st.floats(0, 6), min_size=1, max_size=8))
-    def test_the_same_time_gives_the_same_result_after_any_other(self, times: list[float]) -> None:
-        queried, fresh = self.history(0.05), self.history(0.05)
-        for time in times:
-            result = queried.apparent_n(time)
-        assert result.tolist() == fresh.apparent_n(times[-1]).tolist()
-
-    def test_potential_and_temperature_are_functions_of_time(self) -> None:
-        calm = replace(S1, fluctuation=Fluctuation())
-        history = SheetHistory(
-            calm, 1, lambda _: 2.0, step_s=0.01, powered=lambda t: t < 2, warmer_k=lambda t: 10 * (t > 1)
-        )
-        cold, warm, off = (float(history.apparent_n(t)[0]) for t in (0.995, 1.995, 2.5))
-        assert warm / cold == pytest.approx(1.1, abs=0.02)
-        assert off == 0
-
-    def test_the_result_depends_little_on_the_grid(self) -> None:
-        calm = replace(S1, fluctuation=Fluctuation())
-        coarse, fine = (
-            SheetHistory(calm, 1, lambda t: 2 + np.sin(t), step_s=s).apparent_n(5.0) for s in (0.01, 0.001)
-        )
-        np.testing.assert_allclose(coarse, fine, rtol=0.01)
-
-    def test_a_grid_step_that_is_not_positive_is_rejected(self) -> None:
-        with pytest.raises(ValueError, match="step_s"):
-            self.history(0.0)

@@ -14,8 +14,8 @@ import pytest
 
 from docs.wire_tables import with_tables
 from handtouch import wire
-from handtouch.config.tables import Output
 from handtouch.wire import inputs
+from handtouch.wire.contact import Output
 from handtouch.wire.declarations import FieldDeclaration, declared_fields
 from handtouch.wire.health import Emergency
 from handtouch.wire.schema import json_schema

@@ -17,10 +17,8 @@ from typing import Any, Literal, NotRequired, TypedDict, TypeVar, cast
 from handtouch import wire
 from handtouch.client.subscriber import request
 from handtouch.host.endpoints import CONTROL_ENDPOINT
+from handtouch.wire.contact import Output
 
-Output = Literal[
-    "position", "force", "palm", "base", "raw", "motion", "shape", "friction", "object", "stiffness"
-]
 SHORT_TIMEOUT_S, LONG_TIMEOUT_S = 3.0, 60.0
 SLOW_COMMANDS = ("tare", "reload")
 M = TypeVar("M")

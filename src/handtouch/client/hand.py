@@ -23,7 +23,7 @@ from zmq import zmq_poll
 
 from handtouch import wire
 from handtouch.client.connection import Connection
-from handtouch.client.control import DaemonControl, Output, Scenes, TareResult
+from handtouch.client.control import DaemonControl, Scenes, TareResult
 from handtouch.client.daemon_clock import DaemonClock, age_limit_s
 from handtouch.client.hand_arrays import FrameName, HandArrays, LinkColumns
 from handtouch.client.hand_state import HandState
@@ -36,6 +36,7 @@ from handtouch.client.window import HandWindow
 from handtouch.client.wrench import Wrench
 from handtouch.host.closing import AsyncClosing
 from handtouch.host.endpoints import CONTROL_ENDPOINT, LIVE_ENDPOINT
+from handtouch.wire.contact import Output
 
 QUEUE_MESSAGES = 10_000
 """Messages that wait in this process: those of 4 s with 10 contacts at 200 Hz. Further ones are lost."""

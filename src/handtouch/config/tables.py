@@ -33,6 +33,7 @@ from handtouch.host.endpoints import (
     INPUTS_ENDPOINT,
     LIVE_ENDPOINT,
 )
+from handtouch.wire.contact import Output
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
@@ -43,9 +44,6 @@ def _refuse_removed(output: object) -> object:
     return output
 
 
-Output = Literal[
-    "position", "force", "raw", "palm", "base", "motion", "shape", "friction", "object", "stiffness"
-]
 RequestedOutput = Annotated[Output, BeforeValidator(_refuse_removed)]
 Ends = Annotated[tuple[NonNegative, NonNegative], Field(strict=False)]
 Electrode = Literal["x0", "xa", "y0", "yb"]

@@ -1,8 +1,8 @@
 """Memory of arrays as the stages take it: flat memoryviews, which Python reads as its own numbers, and rows
 of named numbers.
 
-Public names: `view_memory`, `view_rows`, `rows_at`, `rows_by_name`, `number_row`, `slices_of`, `row_count`,
-`RowArray`.
+Public names: `view_memory`, `number_memory`, `view_rows`, `rows_at`, `rows_by_name`, `number_row`,
+`slices_of`, `row_count`, `RowArray`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ def view_memory(array: NDArray[Any]) -> memoryview[Any]:
         raise ValueError(f"an array of shape {array.shape} isn't contiguous")
     memory: memoryview[Any] = (array.view(np.uint8) if array.dtype == np.bool_ else array).reshape(-1).data
     return memory
+
+
+def number_memory(count: int) -> memoryview[float]:
+    """Return memory of numbers (count,), all 0."""
+    return view_memory(np.zeros(count))
 
 
 def view_rows(array: NDArray[Any], row: np.dtype[np.void]) -> RowArray:

@@ -30,7 +30,7 @@ from handtouch.field.surface import (
 )
 
 if TYPE_CHECKING:
-    from handtouch.field.residual import PointTest, point_test, resolvable_separation
+    from handtouch.field.residual import PointTest, point_test
 
 __all__ = [
     "AnisotropicSurface",
@@ -58,10 +58,9 @@ __all__ = [
     "contact_stack_resistance",
     "estimate",
     "point_test",
-    "resolvable_separation",
 ]
 
-_LATER = dict.fromkeys(("PointTest", "point_test", "resolvable_separation"), "residual")
+_LATER = dict.fromkeys(("PointTest", "point_test"), "residual")
 """Names that load their module when they are used: the daemon needs none of them"""
 
 

@@ -1,14 +1,13 @@
 """The paper's own methods by name: its sums for the currents, its log ratio for the location.
 
-Public names: `double_sum_fractions` (eq. 3), `single_sum_fractions` (eqs. 4-5), `log_ratio` (eq. 8), and
-`LogRatioTable`, which is eq. 8 adjusted as in fig. 3 with the look-up table that the paper suggests.
+Public names: `single_sum_fractions` (eqs. 4-5), `log_ratio` (eq. 8), and `LogRatioTable`, which is eq. 8
+adjusted as in fig. 3 with the look-up table that the paper suggests.
 `Rectangle` computes the same exactly and faster; these serve figures and comparison.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -18,21 +17,22 @@ from handtouch.field.model import FloatArray
 from handtouch.field.rectangle import Rectangle
 
 
-def double_sum_fractions(pad: Rectangle, x: ArrayLike, y: ArrayLike, terms: int = 531) -> FloatArray:
-    """Return the fractions of x0, xa, y0, yb, (4, ...), from eq. 3 with both sums cut at `terms`.
-
-    531, the paper's choice, gives 6e-3. Time and memory grow with terms^2 and terms.
-    """
-    return _by_side(_double_sum, pad, x, y, terms)
-
-
 def single_sum_fractions(pad: Rectangle, x: ArrayLike, y: ArrayLike, terms: int = 10) -> FloatArray:
     """Return the fractions of x0, xa, y0, yb, (4, ...), from eqs. 4-5 cut after `terms`.
 
     Ten terms, the paper's choice, give 5e-3 within 5 % of the edges. The ratio of sinh is taken as
     exponentials, which do not overflow.
     """
-    return _by_side(_single_sum, pad, x, y, terms)
+    if terms < 1:
+        raise ValueError(f"terms = {terms}: a sum has at least one")
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    a, b = pad.a, pad.b
+    with np.errstate(all="ignore"):  # NaN off the pad
+        on = (x >= 0) & (x <= a) & (y >= 0) & (y <= b)
+        x, y = np.where(on, x, np.nan).ravel(), np.where(on, y, np.nan).ravel()
+        along_x = _single_sum(a, b, x, y, terms), _single_sum(a, b, a - x, y, terms)
+        along_y = _single_sum(b, a, y, x, terms), _single_sum(b, a, b - y, x, terms)
+        return np.stack([*along_x, *along_y]).reshape(4, *on.shape)
 
 
 def log_ratio(pad: Rectangle, currents: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -133,40 +133,6 @@ class LogRatioTable:
         low = table[i, j] * (1 - u) + table[i + 1, j] * u
         high = table[i, j + 1] * (1 - u) + table[i + 1, j + 1] * u
         return np.moveaxis(low * (1 - v) + high * v, -1, 0)
-
-
-_SideSum = Callable[[float, float, FloatArray, FloatArray, int], FloatArray]
-
-
-def _by_side(sum_of_side: _SideSum, pad: Rectangle, x: ArrayLike, y: ArrayLike, terms: int) -> FloatArray:
-    """Return the sum for side x0, with each side in turn taken as x0; NaN off the pad."""
-    if terms < 1:
-        raise ValueError(f"terms = {terms}: a sum has at least one")
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-    a, b = pad.a, pad.b
-    with np.errstate(all="ignore"):
-        on = (x >= 0) & (x <= a) & (y >= 0) & (y <= b)
-        x, y = np.where(on, x, np.nan).ravel(), np.where(on, y, np.nan).ravel()
-        return np.stack(
-            [
-                sum_of_side(a, b, x, y, terms),
-                sum_of_side(a, b, a - x, y, terms),
-                sum_of_side(b, a, y, x, terms),
-                sum_of_side(b, a, b - y, x, terms),
-            ]
-        ).reshape(4, *on.shape)
-
-
-def _double_sum(
-    depth: float, length: float, distance: FloatArray, along: FloatArray, terms: int
-) -> FloatArray:
-    """Eq. 3: fraction of a side `length` long at `distance`, its opposite `depth` away."""
-    m = np.arange(1.0, terms + 1)
-    odd = 2 * m - 1
-    weights = (m[:, None] / odd * length / depth) / ((m[:, None] / depth) ** 2 + (odd / length) ** 2)
-    waves = np.sin(math.pi / depth * np.multiply.outer(distance, m))
-    modes = np.sin(math.pi / length * np.multiply.outer(along, odd))
-    return np.asarray(8 / (depth * length * math.pi**2) * ((waves @ weights) * modes).sum(axis=-1))
 
 
 def _single_sum(

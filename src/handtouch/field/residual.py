@@ -1,7 +1,6 @@
 """Test of the residual of a point fit: does the contact deviate from a point, and along which axis?
 
-Public names: `point_test` (score, axis and extent of the deviation), `resolvable_separation` (distance from
-which two equal contacts are distinguished from one).
+Public names: `point_test` -> `PointTest` (score, axis and extent of the deviation).
 
 Four currents determine three unknowns, so in units of noise the misfit of a point has one free direction: the
 left null vector of the Jacobian of the fit. Along it the misfit is a standard normal number, the score. A
@@ -22,7 +21,6 @@ from handtouch.field.estimate import BoolArray, PointEstimate, estimate
 from handtouch.field.model import FloatArray, ForwardModel, channel_noise
 
 _DIFFERENCE_STEP = 1e-4  # step of the second derivatives over the distance to the nearest edge
-_BISECTIONS = 24
 
 
 @dataclass(frozen=True)
@@ -80,48 +78,6 @@ def point_test(
     return PointTest(
         score[()], (~(np.abs(score) > threshold))[()], axis[()], extent[()], direction.residual_std[()]
     )
-
-
-def resolvable_separation(
-    model: ForwardModel,
-    x: ArrayLike,
-    y: ArrayLike,
-    noise: ArrayLike,
-    angle: float = 0.0,
-    false_alarm: float = 1e-3,
-    detection: float = 0.9,
-) -> FloatArray:
-    """Return the distance from which two equal contacts centred at (x, y) are distinguished from one,
-    (...).
-
-    noise: standard deviations of the channels, per total current, broadcastable against (4, ...). angle: of
-    the line through them, from x towards y [rad]. They are detected with probability `detection` by
-    `point_test` at `false_alarm`. Infinite where they would have to leave the pad first.
-    """
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-    target_score = _score_threshold(false_alarm) + NormalDist().inv_cdf(detection)
-    direction = math.cos(angle), math.sin(angle)
-    with np.errstate(all="ignore"):
-        margins = [
-            np.where(d != 0, np.minimum(p, side - p) / abs(d), np.inf)
-            for p, side, d in ((x, model.a, direction[0]), (y, model.b, direction[1]))
-        ]
-        longest = 2 * np.minimum(*margins) * (1 - 1e-9)
-        sigma = channel_noise(noise, (4, *x.shape))
-
-        def score(distance: FloatArray) -> FloatArray:
-            half = [distance / 2 * d for d in direction]
-            pair = model.fractions(x - half[0], y - half[1]) + model.fractions(x + half[0], y + half[1])
-            found = estimate(model, pair / 2, sigma, start=(x, y))
-            return np.sqrt(np.asarray(found.chi_squared))
-
-        low, high = np.zeros(x.shape), longest
-        reachable = score(longest) >= target_score
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            enough = score(middle) >= target_score
-            low, high = np.where(enough, low, middle), np.where(enough, middle, high)
-    return np.where(reachable, high, np.inf)[()]
 
 
 def _score_threshold(false_alarm: float) -> float:

@@ -3,14 +3,14 @@
 An estimator that can't decide poses a `Question`: hypotheses with their probabilities, and candidate actions
 with the outcome that each hypothesis predicts. The action with the most expected bits per cost is requested.
 
-Public names: `Question`, `CandidateAction`, `ActionRequest`, `ActionSelector`, `expected_information_bits`,
-`update_probabilities`, `squeeze_action`.
+Public names: `Question`, `CandidateAction`, `ActionRequest`, `ActionSelector`,
+`expected_information_bits`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -145,51 +145,3 @@ def _explain_request(question: Question, action: CandidateAction, bits: float) -
     )
     quantity = f" of {action.outcome_name}" if action.outcome_name else ""
     return f"{outcomes}{quantity}: {bits:.2f} of {open_bits:.2f} bits open"
-
-
-def update_probabilities(question: Question, action: CandidateAction, measured: float) -> dict[str, float]:
-    """Return the probabilities of the hypotheses after the action was done and yielded `measured`."""
-    log_odds = {}
-    for name, prior in question.hypotheses.items():
-        mean, std = action.predicted_outcomes[name]
-        log_odds[name] = math.log(max(prior, 1e-300)) - 0.5 * ((measured - mean) / std) ** 2 - math.log(std)
-    most = max(log_odds.values())
-    weights = {name: math.exp(value - most) for name, value in log_odds.items()}
-    total = sum(weights.values())
-    return {name: weight / total for name, weight in weights.items()}
-
-
-def squeeze_action(
-    curves: Mapping[str, Callable[[float], float]],
-    current_a: float,
-    *,
-    harder: float = 2.0,
-    force_std: float = 0.3,
-    current_std: float = 0.05,
-    between_n: tuple[float, float] = (1e-4, 1e3),
-) -> CandidateAction:
-    """Return the action of pressing `harder` times as hard, for hypotheses of current over force.
-
-    Each hypothesis explains the present current by a force of its own, found on its curve, which must be
-    increasing; the outcome is ln of the current over the present one. force_std: of ln of the actual force
-    ratio, because the controller's force estimate may be crude (paper 4.5, fig. 8); current_std: of ln of the
-    current, the repeatability of sheets. Raises ValueError where a curve doesn't reach the current within
-    `between_n`.
-    """
-    outcomes = {}
-    for name, curve in curves.items():
-        low, high = between_n
-        if not curve(low) < current_a < curve(high):
-            raise ValueError(f"{name}: no force from {low} to {high} N gives {current_a:.3g} A")
-        for _ in range(40):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if curve(middle) < current_a else (low, middle)
-        force = math.sqrt(low * high)
-        slope = math.log(curve(force * harder * 1.01) / curve(force * harder / 1.01)) / (2 * math.log(1.01))
-        outcomes[name] = (
-            math.log(curve(force * harder) / current_a),
-            math.hypot(slope * force_std, current_std),
-        )
-    return CandidateAction(
-        "squeeze", {"force_ratio": harder}, outcomes, outcome_name="ln of current over current now"
-    )

@@ -47,8 +47,6 @@ class PerceptPipeline:
         self.action_selector = ActionSelector()
         self.action_request_pads = np.zeros(buffer.size, dtype=np.bool_)
         """pads (n,) about which actions may be requested"""
-        self.fit_count = 0
-        """fits done so far"""
         self._last_fit_ns = 0
         self._next_estimator = 0  # the first to offer a fit
 
@@ -142,7 +140,6 @@ class PerceptPipeline:
             ):
                 self._next_estimator += number + 1
                 self._last_fit_ns = tick_ns
-                self.fit_count += 1
                 return estimator.fit_contact(self.buffer, pad, tick_ns)
         return ()
 

@@ -11,7 +11,6 @@ from handtouch.sheet.bank import (
     check_learned,
 )
 from handtouch.sheet.behaviour import (
-    SheetHistory,
     SheetModel,
     SheetModelState,
     SheetStep,
@@ -56,7 +55,6 @@ __all__ = [
     "ParameterUncertainty",
     "PrandtlIshlinskii",
     "SheetCompensator",
-    "SheetHistory",
     "SheetModel",
     "SheetModelState",
     "SheetStep",

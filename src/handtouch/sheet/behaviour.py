@@ -1,6 +1,6 @@
 """Forward model of a sheet: true load -> apparent load that follows from the contact's resistance.
 
-Public names: `SheetModel`, `TemperatureResponse`, `SheetModelState`, `SheetStep`, `SheetHistory`.
+Public names: `SheetModel`, `TemperatureResponse`, `SheetModelState`, `SheetStep`.
 
 The *apparent* load is the load under which a fresh, ideal layer has the same conductance: it replaces the
 force in sigma = k / pressure^alpha (`field.ContactLaw`). The layer's conductance is then
@@ -13,7 +13,6 @@ undoes them in reverse:
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,50 +114,3 @@ class SheetStep:
         effective = self._adaptation.forward(state.adaptation, pressing, np.asarray(powered, np.bool_))
         reading = self._creep.forward(state.creep_elements, effective) * (1 + swelling.gain_per_k * warmth)
         return self._model.fluctuation.apply_to(state.fluctuation, reading, self._dt_s)
-
-
-class SheetHistory:
-    """A sheet's history as a function of time, for a simulator that samples it.
-
-    The state advances on a grid of `step_s` from time 0, whatever the sampling, so that `apparent_n(t)`
-    depends on `t_s` alone. Times may go back, at the cost of computing the history again.
-
-    loads, powered, warmer_k: functions of time [s] with the arguments of `SheetStep.forward`; their past must
-    not change. Raises ValueError for a step that isn't positive.
-    """
-
-    def __init__(
-        self,
-        model: SheetModel,
-        pads: int,
-        loads: Callable[[float], npt.ArrayLike],
-        *,
-        seed: int = 1,
-        step_s: float = 2e-3,
-        powered: Callable[[float], npt.ArrayLike] = lambda _: True,
-        warmer_k: Callable[[float], npt.ArrayLike] = lambda _: 0.0,
-    ) -> None:
-        if not 0 < step_s < np.inf:
-            raise ValueError(f"step_s must be positive and finite, got {step_s}")
-        self._model, self._step_s = model, step_s
-        self._loads, self._powered, self._warmer_k = loads, powered, warmer_k
-        self._initial_state = model.initial_state(pads, seed)
-        self._full_step = model.discretise(step_s)
-        self._restart()
-
-    def apparent_n(self, t_s: float) -> FloatArray:
-        """Return the apparent loads (n,) [N] at `t_s` >= 0."""
-        count = int(t_s / self._step_s)
-        if count < self._count:
-            self._restart()
-        while self._count < count:
-            self._count += 1
-            self._forward(self._full_step, self._state, self._count * self._step_s)
-        rest = self._model.discretise(max(t_s - count * self._step_s, 0.0))
-        return self._forward(rest, self._state.copy(), t_s)
-
-    def _forward(self, step: SheetStep, state: SheetModelState, t_s: float) -> FloatArray:
-        return step.forward(state, self._loads(t_s), self._powered(t_s), self._warmer_k(t_s))
-
-    def _restart(self) -> None:
-        self._state, self._count = self._initial_state.copy(), 0

@@ -1,14 +1,14 @@
 """Compliant objects for the simulated gripper, integrated in steps of time.
 
-Public names: `SoftBlock`, `CurvedEdge`, `GripperObject`, `FingertipPositions`, `FingertipContact`,
-`GRIPPER_OBJECTS`. Metres, newton, seconds, in the base's frame.
+Public names: `SoftBlock`, `CurvedEdge`, `FingertipPositions`, `FingertipContact`, `GRIPPER_OBJECTS`.
+Metres, newton, seconds, in the base's frame.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,19 +36,6 @@ class FingertipContact(NamedTuple):
     offset: tuple[float, float]
     """Along x and z: from the centre of the thumb's plate [m]; on the index tip the sines of the angles."""
     force_n: float
-
-
-class GripperObject(Protocol):
-    """Object between the fingers."""
-
-    def advance(self, dt_s: float, tips: FingertipPositions) -> list[FingertipContact]:
-        """Advance by `dt_s` with the fingertips at these positions; return the contacts then."""
-
-    def set_pull(self, force_n: float) -> None:
-        """Set the external force along +x."""
-
-    def truth(self) -> dict[str, float]:
-        """Return ground truth by name; the names end in the unit."""
 
 
 @dataclass

@@ -39,6 +39,10 @@ EndReason = Literal["released", "stale", "lost", "faulted", "off", "restarted", 
 ContactEvent = Literal["begin", "update", "end"]
 
 PerceptKind = Literal["motion", "shape", "friction", "object", "stiffness", "action_request"]
+Output = Literal[
+    "position", "force", "raw", "palm", "base", "motion", "shape", "friction", "object", "stiffness"
+]
+"""What a scene may request of a contact"""
 PERCEPT_KINDS = ("motion", "shape", "friction", "object", "stiffness")
 """Kinds of percepts, each a topic `percept/<hand>/<kind>`."""
 ACTION_REQUEST = "action_request"

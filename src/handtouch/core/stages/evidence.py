@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from handtouch.core.memory import RowArray, row_count, view_memory, view_rows
+from handtouch.core.memory import RowArray, number_memory, row_count, view_memory, view_rows
 
 _WINDOW_MS = (10, 20, 50, 100)
 _LINK_WINDOW_MS = (20, 50, 100)  # shorter ones show the noise of encoders alone
@@ -156,8 +156,9 @@ class EvidenceStage:
         self.features, self.log_odds = arrays["features"], arrays["log_odds"]
         self.rows = view_rows(np.asarray(arrays["features"]), FEATURE_ROW)
         self.evidence_ns = arrays["evidence_ns"]
-        self.velocities, self.velocity_std = _numbers(3 * n), _numbers(n)
-        self.ways, self.own_odds, self.due = _numbers(3 * n), _numbers(n), view_memory(np.zeros(n, np.intp))
+        self.velocities, self.velocity_std = number_memory(3 * n), number_memory(n)
+        self.ways, self.own_odds = number_memory(3 * n), number_memory(n)
+        self.due = view_memory(np.zeros(n, np.intp))
         self.body = np.zeros(1, BODY_ROW).view(np.recarray)
         for pad in range(n):
             self.velocity_std[pad] = _NAN
@@ -235,10 +236,6 @@ class EvidenceStage:
     def compute_features(self, pads: memoryview[int]) -> None:
         """Compute the features of the contacts on these pads alone."""
         _compute_features(self, pads, len(pads))
-
-
-def _numbers(count: int) -> memoryview[float]:
-    return view_memory(np.zeros(count))
 
 
 def _update_contact(stage: EvidenceStage, pad: int, others: int, total: float, now_ns: int) -> None:

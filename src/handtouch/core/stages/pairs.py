@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from handtouch.core.memory import view_memory
+from handtouch.core.memory import number_memory
 from handtouch.core.pad_tables import SEARCH_POINTS
 from handtouch.core.stages import locate, tables, tolerances
 
@@ -46,23 +44,19 @@ class PairFit:
         n = electrodes
         self.grid_points = (SEARCH_POINTS + _GRID_STEP - 1) // _GRID_STEP
         points = self.grid_points * self.grid_points
-        self.raw, self.fractions = _numbers(3 * (n + 1)), _numbers(2 * n)
-        self.whitened, self.slopes = _numbers(2 * n), _numbers(4 * n)
-        self.spreading = _numbers(6)
-        self.normal, self.factor, self.covariance = _numbers(16), _numbers(16), _numbers(16)
-        self.gradient, self.step, self.mixing = _numbers(4), _numbers(4), _numbers(8)
-        self.place, self.best, self.other = _numbers(4), _numbers(4), _numbers(4)
-        self.total, self.var_total, self.with_total = _numbers(2), _numbers(2), _numbers(4)
-        self.weakest, self.apart = _numbers(4), _numbers(4)
-        self.solutions = _numbers(_SOLUTION * _MAX_SOLUTIONS)
-        self.grid, self.gain = _numbers(points * n), _numbers(points * points)
+        self.raw, self.fractions = number_memory(3 * (n + 1)), number_memory(2 * n)
+        self.whitened, self.slopes = number_memory(2 * n), number_memory(4 * n)
+        self.spreading = number_memory(6)
+        self.normal, self.factor, self.covariance = number_memory(16), number_memory(16), number_memory(16)
+        self.gradient, self.step, self.mixing = number_memory(4), number_memory(4), number_memory(8)
+        self.place, self.best, self.other = number_memory(4), number_memory(4), number_memory(4)
+        self.total, self.var_total, self.with_total = number_memory(2), number_memory(2), number_memory(4)
+        self.weakest, self.apart = number_memory(4), number_memory(4)
+        self.solutions = number_memory(_SOLUTION * _MAX_SOLUTIONS)
+        self.grid, self.gain = number_memory(points * n), number_memory(points * points)
         self.cost = self.decrement = self.g11 = self.g12 = self.g22 = 0.0
         self.count = 0
         self.is_settled = self.is_unique = self.found = False
-
-
-def _numbers(count: int) -> memoryview[float]:
-    return view_memory(np.zeros(count))
 
 
 def fit_pair(

@@ -36,9 +36,6 @@ class PageServer:
 
     def __init__(self, values: VersionedValues, host: str, port: int) -> None:
         self.values = values
-        self.open_pages = 0
-        self.updates_sent = 0
-        """sets of changes, to all pages together"""
         self.pages_opened = 0
         """since the start"""
         self.condition = threading.Condition()
@@ -108,7 +105,6 @@ class _PageHandler(BoundedRequestHandler):
         self.wfile.write(f"retry: {_RETRY_MS}\n\n".encode())
         owner, version, notification = self._owner, 0, -1
         with owner.condition:
-            owner.open_pages += 1
             owner.pages_opened += 1
         try:
             while not owner.closing:
@@ -119,11 +115,7 @@ class _PageHandler(BoundedRequestHandler):
                     version, notification = owner.values.version, owner.notifications
                 if changes:
                     self.wfile.write(f"data: {json.dumps(changes, separators=(',', ':'))}\n\n".encode())
-                    owner.updates_sent += 1
                 else:
                     self.wfile.write(b": keepalive\n\n")
         except OSError:
             pass  # the page was closed
-        finally:
-            with owner.condition:
-                owner.open_pages -= 1
