@@ -59,7 +59,7 @@ from handtouch.procedures.calibrate.readings import (
     parse_weights,
 )
 from handtouch.procedures.dialogue import Key
-from handtouch.sheet import S1, SheetCompensator, SheetHistory
+from handtouch.sheet import S1, SheetCompensator
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.sheet_physics import ElementCreep, SheetStates
 from handtouch.simulate.touch import ScenarioTouch
@@ -67,6 +67,7 @@ from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS
 from tests.deployments import deployment_text, pad_text
 from tests.sandwich import Sandwich
+from tests.sheets import apparent_load
 
 TRUE = {"contact_ohm_mm2": 14_000.0, "alpha": 1.62, "ohm_per_square": 2900.0}
 FIVE = "20,50,100,200,500"
@@ -318,12 +319,11 @@ def settle(
 def test_reading_waits_for_creep_and_tolerates_noise_of_the_sheet() -> None:
     errors, times = [], []
     for seed in range(4):
-        sheet = SheetHistory(S1, 1, lambda _: 1.0, seed=seed)
-        press = float(sheet.apparent_n(6.0)[0])
-        settled = settle(lambda t_s, sheet=sheet: 1e-3 * float(sheet.apparent_n(t_s)[0]))  # type: ignore[misc]
+        press, reading = (apparent_load(S1, lambda _: 1.0, seed) for _ in range(2))
+        settled = settle(lambda t_s, reading=reading: 1e-3 * reading(t_s))  # type: ignore[misc]
         assert settled is not None
         times.append(settled[0])
-        errors.append(settled[1] / (1e-3 * press) - 1)
+        errors.append(settled[1] / (1e-3 * press(6.0)) - 1)
     assert max(times) < 6.0
     assert np.sqrt(np.mean(np.square(errors))) < 0.02  # noise of 1 % included
 

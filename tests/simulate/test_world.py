@@ -14,7 +14,6 @@ from handtouch.sheet import (
     S1,
     S2,
     Fluctuation,
-    SheetHistory,
     SheetModel,
 )
 from handtouch.simulate import noise
@@ -37,6 +36,7 @@ from handtouch.simulate.worlds import (
     World,
 )
 from tests.deployments import SIX_ARCS, arcs_text
+from tests.sheets import apparent_load
 
 
 def kind_of(law: SheetLaw) -> SheetKind:
@@ -82,9 +82,9 @@ def test_held_force_reads_as_in_sheet_model(
         return sum(touch.force_at(t_s) for touch in scenario.touches)
 
     calm_model = dataclasses.replace(model, fluctuation=Fluctuation())
-    track = SheetHistory(calm_model, 1, lambda t_s: [force_n(t_s)], step_s=1e-3)
+    track = apparent_load(calm_model, force_n, step_s=1e-3)
     times = np.concatenate([np.arange(1.2, 4, 0.3), np.arange(6.3, 35.5, 1.3), np.arange(37.2, 41.8, 0.4)])
-    expected = [track.apparent_n(t)[0] / force_n(t) for t in times]
+    expected = [track(t) / force_n(t) for t in times]
     np.testing.assert_allclose(pad.force_ratio(times), expected, atol=0.015)
 
 

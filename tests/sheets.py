@@ -1,0 +1,24 @@
+"""Readings of a sheet over time, by its forward model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from handtouch.sheet import SheetModel
+
+
+def apparent_load(
+    model: SheetModel, load_n: Callable[[float], float], seed: int = 1, step_s: float = 2e-3
+) -> Callable[[float], float]:
+    """Return the apparent load [N] of a sheet as a function of time [s], to be called with rising times."""
+    state, step, count = model.initial_state(1, seed), model.discretise(step_s), 0
+
+    def at(t_s: float) -> float:
+        nonlocal count
+        while count < int(t_s / step_s):
+            count += 1
+            step.forward(state, load_n(count * step_s))
+        rest = model.discretise(max(t_s - count * step_s, 0.0))
+        return float(rest.forward(state.copy(), load_n(t_s))[0])
+
+    return at
