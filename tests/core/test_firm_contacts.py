@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from handtouch.config import load, shipped
+from handtouch.config import Behaviour, load, shipped
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.columns import TickResult
 from handtouch.core.pad_model import contact_law, law_of
@@ -30,8 +30,13 @@ DISC = np.array(
 class Hand:
     """The hand of config/utah_mit.toml, pressed by discs of uniform current at places (n, 2) of its pads."""
 
-    def __init__(self, seed: int) -> None:
-        self.deployment = load(shipped.path("utah_mit.toml"))
+    def __init__(self, seed: int, behaviour: Behaviour | None = None) -> None:
+        deployment = load(shipped.path("utah_mit.toml"))
+        described = {
+            name: sheet.model_copy(update={"behaviour": behaviour})
+            for name, sheet in deployment.sheets.items()
+        }
+        self.deployment = deployment.model_copy(update={"sheets": described})
         self.model = build_pad_model(self.deployment)
         self.pads = [pad for _, pad in self.deployment.pads]
         self.surfaces = [pad_surface(pad) for pad in self.pads]
@@ -98,6 +103,23 @@ def test_no_contact_ends_or_loses_its_values_because_it_is_firm() -> None:
         assert (begun == 1).all()
         assert (hand.tick.columns.state == PadState.CLEAR).all()
     assert saturated > 100
+    assert np.mean(bounds) > 0.95
+
+
+def test_forces_of_firm_contacts_stay_bounds_on_sheets_with_a_behaviour() -> None:
+    """While they are held, too, as uncertainties are updated ten times a second."""
+    hand, bounds = Hand(1, Behaviour(preset="S1")), []
+    for _ in range(6):
+        at = hand.rng.uniform(0.002, 0.998, (hand.size, 2))
+        force_n = hand.rng.uniform(5.0, MAX_FORCE_N, hand.size)
+        for share in (*RAMP[:4], *[1.0] * 50):
+            hand.step(hand.counts(at, share * force_n))
+        columns = hand.tick.columns
+        assert np.isfinite(columns.force_n).all()
+        bounds += (columns.force_n <= force_n)[columns.force_status == ForceStatus.LOWER_BOUND].tolist()
+        for _ in range(12):
+            hand.step(np.zeros((hand.size, 4)))
+    assert len(bounds) > 10
     assert np.mean(bounds) > 0.95
 
 

@@ -389,8 +389,10 @@ class SheetForceCompensation:
         force = self.force_n[pressed]
         for group in self.groups:
             self.std_n[group.rows] = group.compensator.std_n()
+        law_n = self._held.uncompensated_std_n[pressed]
+        law_n = np.where(law_n < np.inf, law_n, 0.0)  # a lower bound of the law has its margin
         with np.errstate(all="ignore"):
-            relative = self._held.uncompensated_std_n[pressed] / apparent_n[pressed]
+            relative = law_n / apparent_n[pressed]
             # either includes the error of the contact law
             common = np.maximum(relative, self.log_gain_std[pressed])
             variance = np.square(self.std_n[pressed]) + np.square(force * common)

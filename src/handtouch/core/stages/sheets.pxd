@@ -1,10 +1,11 @@
 cimport cython
+from libc cimport math
 from handtouch.core.stages cimport loads
 from handtouch.core.stages.loads cimport SheetInterval, SheetLoads
 from handtouch.core.stages.rows cimport SheetLoadRow, ValueRow
 
 cdef Py_ssize_t _INVALID
-cdef double _BOUNDED, _NAN, _INFINITY
+cdef double _BOUNDED, _BOUND_SIGMA, _NAN, _INFINITY
 cdef long long _MAX_PAUSE_NS
 
 cdef class SheetStage:
@@ -14,7 +15,7 @@ cdef class SheetStage:
     cdef long long period_ns, periods
     cdef double update_period_s
     cdef unsigned char[::1] touching, reliability, new_contact
-    cdef double[::1] max_force_n, gain, apparent_n, flow_s, impulse_ns
+    cdef double[::1] max_force_n, gain, apparent_n, law_std_n, flow_s, impulse_ns
     cdef double[::1] back_waited_s, force_n, std_n, relative_std, waited_s
     cdef ValueRow[:] values
     cdef SheetLoadRow[:] results
@@ -25,7 +26,7 @@ cdef class SheetStage:
     cpdef compensate_forces(self, long long sync_ns)
     @cython.locals(uncertainties=bint)
     cpdef complete_update(self)
-    @cython.locals(row=Py_ssize_t, pad=Py_ssize_t, force=double, saturated=bint)
+    @cython.locals(row=Py_ssize_t, pad=Py_ssize_t, force=double, relative=double, law=double, bounded=bint)
     cpdef store_forces(self)
 
 cdef _find_steps(SheetStage stage, long long periods)

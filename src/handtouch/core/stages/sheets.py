@@ -6,6 +6,7 @@ Public names: `SheetStage`. The equations are those of
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -15,6 +16,7 @@ from handtouch.core.stages import loads
 from handtouch.core.stages.force import BOUNDED
 from handtouch.core.stages.loads import SheetInterval, SheetLoads
 from handtouch.core.stages.solve import VALUE_ROW
+from handtouch.field import contact_law
 
 if TYPE_CHECKING:
     from handtouch.core.state import TickState
@@ -23,7 +25,7 @@ UPDATE_PERIOD_S = 0.1
 """Period of updates of back forces and uncertainties"""
 SHEET_LOAD_ROW = np.dtype([("load", "<f8"), ("before", "<f8"), ("effective", "<f8"), ("reading", "<f8")])
 """Load of a sheet in a tick, that before hysteresis, the effective one, and the reading [N]"""
-_BOUNDED = float(BOUNDED)
+_BOUNDED, _BOUND_SIGMA = float(BOUNDED), contact_law.BOUND_SIGMA
 _INVALID = 2  # ForceReliability
 _NAN, _INFINITY = float("nan"), float("inf")
 _MAX_PAUSE_NS = 3600 * 1_000_000_000
@@ -67,7 +69,7 @@ class SheetStage:
         self.pads, self.sheets, self.gain, self.results = pads, len(pads), gain, results
         self.max_force_n, self.period_ns = max_force_n, period_ns
         self.touching, self.values = arrays["touching"], view_rows(held.values, VALUE_ROW)
-        self.apparent_n = arrays["uncompensated_force_n"]
+        self.apparent_n, self.law_std_n = arrays["uncompensated_force_n"], arrays["uncompensated_std_n"]
         self.flow_s, self.impulse_ns = arrays["flow_s"], arrays["impulse_ns"]
         self.back_waited_s = arrays["back_waited_s"]
         self.force_n, self.std_n = arrays["compensated_force_n"], arrays["compensated_std_n"]
@@ -107,18 +109,26 @@ class SheetStage:
             self.owner.update(uncertainties)
 
     def store_forces(self) -> None:
-        """Replace the forces of touched pads in the contacts' values by compensated ones."""
+        """Replace the forces of touched pads in the contacts' values by compensated ones.
+
+        Lower bounds stay such: they are less by what the sheet's state leaves open.
+        """
         for row in range(self.sheets):
             pad = self.pads[row]
             if not self.touching[pad]:
                 continue
-            force = self.force_n[pad]
-            self.std_n[pad] = force * self.relative_std[pad]
+            force, relative = self.force_n[pad], self.relative_std[pad]
+            law = self.law_std_n[pad] / self.apparent_n[pad] if self.apparent_n[pad] > 0.0 else 0.0
+            if relative < law < _INFINITY:  # it has grown since the last update
+                relative = law
+            self.std_n[pad] = force * relative
+            bounded = self.values[pad].force_status == _BOUNDED
+            if bounded:
+                force *= math.exp(-_BOUND_SIGMA * relative)
             if force > self.max_force_n[row]:
                 force = self.max_force_n[row]
-            self.values[pad].force_n = _NAN if self.reliability[pad] == _INVALID else force
-            saturated = self.values[pad].force_status == _BOUNDED
-            self.values[pad].force_std_n = _INFINITY if saturated else self.std_n[pad]
+            self.values[pad].force_n = _NAN if self.reliability[pad] == _INVALID and not bounded else force
+            self.values[pad].force_std_n = _INFINITY if bounded else self.std_n[pad]
 
 
 def _find_steps(stage: SheetStage, periods: int) -> None:
