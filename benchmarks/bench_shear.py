@@ -29,7 +29,7 @@ from handtouch.config import Deployment, load, shipped
 from handtouch.config.shear import Shear
 from handtouch.core.pad_model import PadModel
 from handtouch.field.elastic_layer import calibrate_layer
-from handtouch.field.shear import ShearPad
+from handtouch.field.shear_estimate import ShearPad
 from handtouch.hand import mount_transform
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad

@@ -16,7 +16,7 @@ from handtouch.core.slab import ChannelField, Slab
 from handtouch.core.stages.shear import ShearForces, ShearTable
 from handtouch.core.stages.solve import MOUNT_COUNT
 from handtouch.core.state import TickState
-from handtouch.field.shear import ShearPad
+from handtouch.field.shear_estimate import ShearPad
 from handtouch.hand import mount_transform
 from handtouch.wire import ForceStatus, PadState, PositionStatus
 from tests.deployments import deployment_text, pad_text

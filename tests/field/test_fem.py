@@ -19,14 +19,14 @@ from scipy.sparse.linalg import spsolve
 from skfem import Basis, BilinearForm, ElementQuad1, MeshQuad, asm
 from skfem.helpers import grad
 
-from handtouch.field.network import SIDES, ElectrodeNetwork
-from handtouch.field.rectangle import Rectangle
-from handtouch.field.surface import (
+from handtouch.field import (
     ConeSurface,
     RevolutionSurface,
     SphereSurface,
     Surface,
 )
+from handtouch.field.network import SIDES, ElectrodeNetwork
+from handtouch.field.rectangle import Rectangle
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.field.contact_law import ContactLaw, contact_stack_resistance
-from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.surface import (
+from handtouch.field import (
     AnisotropicSurface,
     ConeSurface,
     CylinderSurface,
@@ -20,6 +18,8 @@ from handtouch.field.surface import (
     RevolutionSurface,
     SphereSurface,
 )
+from handtouch.field.contact_law import ContactLaw, contact_stack_resistance
+from handtouch.field.network import ElectrodeNetwork
 
 ODD = [0.0, -0.0, 5e-324, 1e-300, 1e-160, 0.3, 0.7, 1.0, -0.1, 1e160, 1e300, math.inf, -math.inf, math.nan]
 X, Y = (v.ravel() for v in np.meshgrid(ODD, ODD))

@@ -12,7 +12,7 @@ from handtouch.config import SurfaceTable, surface_table
 from handtouch.core.pad_tables import SurfacePatches
 from handtouch.field import BoundaryElectrode, Outline, OutlineNetwork
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from tests.simulate.surfaces import OUTLINE_TABLES
 
 GAP_M = 0.6e-3

@@ -13,12 +13,12 @@ from handtouch.field.shear import (
     BarPattern,
     DiscPattern,
     FilmLaw,
-    ShearPad,
     ShearPattern,
     edge_excess,
     gap_loss,
     overlap_ratio,
 )
+from handtouch.field.shear_estimate import ShearPad
 
 MM = 1e-3
 BARS = (0.6 * MM, 6 * MM, 0.4 * MM, 0.15 * MM)

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.field.surface import (
+from handtouch.field import (
     AnisotropicSurface,
     ConeSurface,
     CylinderSurface,

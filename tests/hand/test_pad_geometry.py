@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from handtouch.field.surface import (
+from handtouch.field import (
     AnisotropicSurface,
     ConeSurface,
     CylinderSurface,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from handtouch import config
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.hand import electrode_network, pad_network, pad_surface
 from handtouch.procedures.commission.electrode_order import (
     PRESS_TARGETS,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handtouch.config import SurfaceTable
-from handtouch.field.surface import SURFACES
+from handtouch.field.surface_base import SURFACES
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 from handtouch.simulate.surfaces import simulated_surface

@@ -10,7 +10,8 @@ import pytest
 
 from handtouch.config.shear import Shear
 from handtouch.field.elastic_layer import ElasticLayer
-from handtouch.field.shear import ShearPad, overlap_ratio
+from handtouch.field.shear import overlap_ratio
+from handtouch.field.shear_estimate import ShearPad
 from handtouch.simulate.shear_film import Plates, solve_section
 from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
 from handtouch.simulate.worlds import WORLDS

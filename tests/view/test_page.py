@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from handtouch import config, wire
 from handtouch.config import shipped
 from handtouch.core.stages.kinematics import LinkPoses
-from handtouch.field.surface import (
+from handtouch.field import (
     ConeSurface,
     CylinderSurface,
     PlaneSurface,

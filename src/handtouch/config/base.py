@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -24,3 +27,35 @@ class Table(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, populate_by_name=False
     )
+
+
+class OneOfKinds:
+    """Marks a table that follows one of several models by its key `kind`.
+
+    Errors and schema are those of a union with that discriminator, but only the models of the kinds that a
+    file names are asked of `kinds`.
+    """
+
+    def __init__(self, kinds: Mapping[str, type[Table]]) -> None:
+        self._kinds = kinds
+
+    def __get_pydantic_core_schema__(self, *_: object) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._validate)
+
+    def __get_pydantic_json_schema__(self, _: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        models = {kind: model.__pydantic_core_schema__ for kind, model in self._kinds.items()}
+        return handler(core_schema.tagged_union_schema(models, "kind"))
+
+    def _validate(self, value: object) -> Table:
+        if isinstance(value, Table):
+            return value
+        if not isinstance(value, dict):
+            raise PydanticKnownError("model_attributes_type")
+        context: dict[str, Any] = {"discriminator": "'kind'"}
+        if "kind" not in value:
+            raise PydanticKnownError("union_tag_not_found", context)
+        kind = value["kind"]
+        if not isinstance(kind, str) or kind not in self._kinds:
+            context |= {"tag": str(kind), "expected_tags": ", ".join(map(repr, self._kinds))}
+            raise PydanticKnownError("union_tag_invalid", context)
+        return self._kinds[kind].model_validate(value)

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS
+from handtouch.config.meshes import surface_triangles
 from handtouch.config.problems import Problem, suggest_name
 from handtouch.config.responses import ResponseTable, presses_of
 from handtouch.config.roles import CHANNEL_ROLES, channel_count
 from handtouch.config.shear import Shear
-from handtouch.config.surfaces import film_of, surface_triangles
+from handtouch.config.surfaces import film_of
 from handtouch.config.tables import (
     SIDE_ELECTRODES,
     Bus,
@@ -29,8 +30,7 @@ from handtouch.config.tables import (
     Touch,
 )
 from handtouch.config.units import pad_unit_problems, unit_problems
-from handtouch.field.outline import MIN_CLEARANCE
-from handtouch.field.surface_base import SURFACES, surface_keys
+from handtouch.field.surface_base import MIN_CLEARANCE, SURFACES, surface_keys
 from handtouch.host.endpoints import is_loopback
 
 UDP_MULTICAST_PORT = 43113

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from handtouch import field
 from handtouch.config.base import (
     CHANNEL_RANGE,
     PER_CHANNEL,
@@ -28,10 +29,7 @@ from handtouch.config.base import (
 )
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.embedded_file import embed_file, read_embedded
-from handtouch.field.measured import MapPrior, MeasuredMap, PressTable, unit_signal
 from handtouch.field.surface_base import Surface
-from handtouch.field.taxels import TaxelArray, TaxelContact, TaxelTolerances
-from handtouch.field.two_layers import TwoLayers
 from handtouch.host.plugins import load_plugins
 
 Place = Annotated[tuple[float, ...], Field(strict=False, min_length=2, max_length=3)]
@@ -43,9 +41,9 @@ _MM = 1e-3
 
 
 @lru_cache(maxsize=64)
-def presses_of(file: str) -> PressTable:
+def presses_of(file: str) -> field.PressTable:
     """Return the presses of a file, by its path or embedded. Raises ValueError."""
-    return PressTable(read_embedded(file))
+    return field.PressTable(read_embedded(file))
 
 
 class ResponseTable(Table):
@@ -199,7 +197,7 @@ class Taxels(ForceLaw):
         given = self.signal_per_n
         return sum(given) / len(given) if isinstance(given, tuple) else given
 
-    def build(self, surface: Surface) -> TaxelArray:
+    def build(self, surface: Surface) -> field.TaxelArray:
         for key in ("normals", "width_mm", "signal_per_n"):
             values = getattr(self, key)
             if isinstance(values, tuple) and len(values) != len(self.positions_mm):
@@ -208,17 +206,17 @@ class Taxels(ForceLaw):
             raise ValueError("positions_mm: all must have two numbers, or all three")
         if self.normals is not None and not all(math.hypot(*normal) > 0 for normal in self.normals):
             raise ValueError("normals: must be directions other than 0, 0, 0")
-        array = TaxelArray(
+        array = field.TaxelArray(
             surface,
             [[_MM * number for number in place] for place in self.positions_mm],
             _scaled(self.width_mm, _MM),
             _scaled(self.signal_per_n, 1 / self.unit_signal),
             normals=self.normals,
             profile=self.profile,
-            patch=TaxelContact(
+            patch=field.TaxelContact(
                 _MM * self.contact_radius_mm, _MM * self.contact_radius_std_mm, self.contact_elongation_std
             ),
-            tolerances=TaxelTolerances(
+            tolerances=field.TaxelTolerances(
                 position_m=_MM * self.position_std_mm,
                 width=self.width_std,
                 crosstalk=self.crosstalk_std,
@@ -280,10 +278,10 @@ class TwoLayersTable(ResponseTable):
     def channels(self) -> tuple[str, ...]:
         return "x0", "xa", "y0", "yb"
 
-    def build(self, surface: Surface) -> TwoLayers:
+    def build(self, surface: Surface) -> field.TwoLayers:
         if len(self.lead_ohm) != 4:
             raise ValueError("lead_ohm: needs 4 values, of electrodes x0, xa, y0, yb")
-        return TwoLayers(
+        return field.TwoLayers(
             surface,
             self.ohm_per_square,
             _MM * self.contact_radius_mm,
@@ -328,12 +326,12 @@ class Measured(ForceLaw):
 
     @property
     def unit_signal(self) -> float:
-        return unit_signal(presses_of(self.presses), self.alpha)
+        return field.unit_signal(presses_of(self.presses), self.alpha)
 
     def with_embedded_files(self, folder: Path) -> Self:
         return self.model_copy(update={"presses": embed_file(self.presses, folder)})
 
-    def build(self, surface: Surface) -> MeasuredMap:
+    def build(self, surface: Surface) -> field.MeasuredMap:
         try:
             presses = presses_of(self.presses)
             if presses.signals.shape[1] != len(self.names):
@@ -342,11 +340,11 @@ class Measured(ForceLaw):
         except ValueError as error:
             raise ValueError(f"presses: {error}") from error
 
-    def map_of(self, surface: Surface, presses: PressTable) -> MeasuredMap:
+    def map_of(self, surface: Surface, presses: field.PressTable) -> field.MeasuredMap:
         """Return the map that presses show. Raises ValueError."""
         radius_m, std_m = _MM * self.contact_radius_mm, _MM * self.contact_radius_std_mm
-        prior = MapPrior(alpha=self.alpha)
-        return MeasuredMap(surface, presses, prior, radius_m, std_m, self.contact_elongation_std)
+        prior = field.MapPrior(alpha=self.alpha)
+        return field.MeasuredMap(surface, presses, prior, radius_m, std_m, self.contact_elongation_std)
 
 
 _MIN_RESPONSE = 0.05  # greatest response of a taxel on the pad, over that right on it

@@ -7,19 +7,18 @@ are declared by the surface classes; nothing here names a shape.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Iterator, Mapping
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, TypeAdapter, create_model
 
-from handtouch.config.base import Table
+from handtouch import field
+from handtouch.config.base import OneOfKinds, Table
 from handtouch.field.embedded_file import embed_file, read_embedded
-from handtouch.field.film import Film
-from handtouch.field.surface import SURFACES, AnisotropicSurface, Surface
-from handtouch.field.surface_base import SurfaceKey, surface_keys
-from handtouch.field.triangulation import Triangulation, parse_stl
+from handtouch.field.surface import AnisotropicSurface
+from handtouch.field.surface_base import SURFACES, Surface, SurfaceKey, surface_keys
 from handtouch.host.plugins import load_plugins
 
 load_plugins("handtouch.surfaces", Surface)  # classes that name a kind register themselves
@@ -99,38 +98,43 @@ def _key_field(key: SurfaceKey) -> tuple[Any, Any]:
     )
 
 
-def _definition(kind: str, shape: type[Surface]) -> type[SurfaceTable]:
+@cache
+def _definition(kind: str) -> type[SurfaceTable]:
+    shape = SURFACES[kind]
     fields: dict[str, Any] = {key.name: _key_field(key) for key in surface_keys(shape).values()}
     fields["kind"] = Literal[kind], ...
     doc = (shape.__doc__ or "").partition("\n")[0]
     return create_model(kind.capitalize(), __base__=SurfaceTable, __doc__=doc, __module__=__name__, **fields)
 
 
-SURFACE_TABLES: dict[str, type[SurfaceTable]] = {
-    kind: _definition(kind, shape) for kind, shape in sorted(SURFACES.items())
-}
-"""Definition of the `surface` table of each kind."""
-globals().update({table.__name__: table for table in SURFACE_TABLES.values()})  # where pickle looks for them
+class _SurfaceTables(Mapping[str, type[SurfaceTable]]):
+    """Definition of the `surface` table of each kind, made when it is first asked for."""
 
-if TYPE_CHECKING:
-    PadSurface = SurfaceTable
-else:
-    PadSurface = Annotated[Union[tuple(SURFACE_TABLES.values())], Field(discriminator="kind")]  # noqa: UP007
+    def __getitem__(self, kind: str) -> type[SurfaceTable]:
+        return _definition(kind)
 
-SurfaceTriangles = Triangulation
-"""The triangles of a file, which the simulator builds a geometry of its own from."""
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(SURFACES))
+
+    def __len__(self) -> int:
+        return len(SURFACES)
 
 
-def surface_triangles(file: str, metres_per_unit: float) -> SurfaceTriangles:
-    """Return the triangles [m] of an STL file, by its path or embedded. Raises ValueError."""
-    surface = parse_stl(read_embedded(file))
-    return Triangulation(metres_per_unit * surface.points, surface.triangles)
+SURFACE_TABLES = _SurfaceTables()
+PadSurface = Annotated[SurfaceTable, OneOfKinds(SURFACE_TABLES)]
+
+
+def __getattr__(name: str) -> type[SurfaceTable]:
+    """Return the definition of a kind by the name of its class, as pickle asks for it."""
+    if (kind := name.lower()) not in SURFACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return SURFACE_TABLES[kind]
 
 
 @lru_cache(maxsize=64)
-def film_of(file: str) -> Film:
+def film_of(file: str) -> field.Film:
     """Return the measured film of a file, by its path or embedded. Raises ValueError."""
-    return Film(read_embedded(file))
+    return field.Film(read_embedded(file))
 
 
 _ADAPTER: TypeAdapter[SurfaceTable] = TypeAdapter(PadSurface)

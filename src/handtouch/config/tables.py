@@ -6,6 +6,7 @@ follow one of several models.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -856,8 +857,8 @@ TABLES: dict[str, type[Table]] = {
     "hand.pad.mount": Mount,
     "hand.pad.touch": Touch,
 }
-KINDS: dict[str, dict[str, type[Table]]] = {
-    "surface": {**SURFACE_TABLES},
+KINDS: dict[str, Mapping[str, type[Table]]] = {
+    "surface": SURFACE_TABLES,
     "response": {**RESPONSES},
     "pattern": {**SHEAR_PATTERNS},
     "shape": OBJECT_SHAPES,

@@ -11,7 +11,7 @@ import numpy as np
 
 from handtouch.field.contact_law import MIN_SPREADING_RATIO, ContactLaw
 from handtouch.field.model import ChannelModel
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 
 _POINTS = 25  # along each side
 _MIN_EDGE_SIDES = 1e-3

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.model import ChannelModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 
 FloatArray = NDArray[np.float64]
 

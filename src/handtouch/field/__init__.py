@@ -14,23 +14,43 @@ from handtouch.field.contact_law import (
 from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.model import ForwardModel
 from handtouch.field.network import Electrode, ElectrodeNetwork
-from handtouch.field.outline import Outline
-from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 from handtouch.field.rectangle import Location, Rectangle
-from handtouch.field.surface import (
-    AnisotropicSurface,
-    ConeSurface,
-    CylinderSurface,
-    MeshSurface,
-    PlaneSurface,
-    PrismSurface,
-    RevolutionSurface,
-    SphereSurface,
-    Surface,
-)
+from handtouch.field.surface_base import Surface
 
 if TYPE_CHECKING:
+    from handtouch.field._prism import PrismSurface
+    from handtouch.field._revolution import RevolutionSurface
+    from handtouch.field.film import Film, UnevenNetwork
+    from handtouch.field.measured import MapPrior, MeasuredMap, PressTable, unit_signal
+    from handtouch.field.mesh_surface import MeshSurface
+    from handtouch.field.outline import Outline
+    from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
     from handtouch.field.residual import PointTest, point_test
+    from handtouch.field.surface import (
+        AnisotropicSurface,
+        ConeSurface,
+        CylinderSurface,
+        PlaneSurface,
+        SphereSurface,
+    )
+    from handtouch.field.taxels import TaxelArray, TaxelContact, TaxelTolerances
+    from handtouch.field.two_layers import TwoLayers
+
+_LATER = {
+    **dict.fromkeys(("PointTest", "point_test"), "residual"),
+    **dict.fromkeys(("BoundaryElectrode", "OutlineNetwork"), "outline_network"),
+    **dict.fromkeys(("PlaneSurface", "CylinderSurface", "ConeSurface", "SphereSurface"), "surface"),
+    **dict.fromkeys(("Film", "UnevenNetwork"), "film"),
+    **dict.fromkeys(("MapPrior", "MeasuredMap", "PressTable", "unit_signal"), "measured"),
+    **dict.fromkeys(("TaxelArray", "TaxelContact", "TaxelTolerances"), "taxels"),
+    "AnisotropicSurface": "surface",
+    "MeshSurface": "mesh_surface",
+    "Outline": "outline",
+    "PrismSurface": "_prism",
+    "RevolutionSurface": "_revolution",
+    "TwoLayers": "two_layers",
+}
+"""Modules of the names that load them when they are used, as not every daemon needs them"""
 
 __all__ = [
     "AnisotropicSurface",
@@ -40,28 +60,35 @@ __all__ = [
     "CylinderSurface",
     "Electrode",
     "ElectrodeNetwork",
+    "Film",
     "ForceEstimate",
     "ForceEstimateStatus",
     "ForwardModel",
     "Location",
+    "MapPrior",
+    "MeasuredMap",
     "MeshSurface",
     "Outline",
     "OutlineNetwork",
     "PlaneSurface",
     "PointEstimate",
     "PointTest",
+    "PressTable",
     "PrismSurface",
     "Rectangle",
     "RevolutionSurface",
     "SphereSurface",
     "Surface",
+    "TaxelArray",
+    "TaxelContact",
+    "TaxelTolerances",
+    "TwoLayers",
+    "UnevenNetwork",
     "contact_stack_resistance",
     "estimate",
     "point_test",
+    "unit_signal",
 ]
-
-_LATER = dict.fromkeys(("PointTest", "point_test"), "residual")
-"""Names that load their module when they are used: the daemon needs none of them"""
 
 
 def __getattr__(name: str) -> Any:

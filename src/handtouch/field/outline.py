@@ -14,12 +14,13 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.field.surface_base import MIN_CLEARANCE
+
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 BoolArray = npt.NDArray[np.bool_]
 Point = tuple[float, float]
 
-MIN_CLEARANCE = 1e-4  # shortest edge, and distance of separate edges, over the outline's larger extent
 _MIN_CORNER_RAD = 0.05  # interior angle at a corner, and its distance from a full turn
 _CHECK_POINTS = 65  # per edge, for crossings and clearances
 _LENGTH_NODES = 32

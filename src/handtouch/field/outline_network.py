@@ -20,7 +20,8 @@ import numpy.typing as npt
 from handtouch.field._boundary_panels import Stretch, initial_panels
 from handtouch.field._mixed_problem import MixedProblem
 from handtouch.field._series_resistors import GroundedElectrodes
-from handtouch.field.outline import MIN_CLEARANCE, ComplexArray, FloatArray, Outline
+from handtouch.field.outline import ComplexArray, FloatArray, Outline
+from handtouch.field.surface_base import MIN_CLEARANCE
 
 _SMOOTH_ANGLE_RAD = 1e-9
 _MAX_IMAGE_DISTANCE = 0.5  # distance of a point from its mirror image, over the larger extent

@@ -1,8 +1,7 @@
 """Sensor surfaces, each with the conformal map that makes it a rectangle.
 
-Public names: `Surface` and its kinds `PlaneSurface`, `PrismSurface`, `CylinderSurface`, `ConeSurface`,
-`SphereSurface`, `RevolutionSurface`, `OutlineSurface`, `OutlineOnCylinder`, `OutlineOnSphere`;
-`AnisotropicSurface` wraps any of them; `SURFACES` is their registry.
+Public names: `PlaneSurface`, `CylinderSurface`, `ConeSurface`, `SphereSurface`; `AnisotropicSurface` wraps
+any `Surface`. Other kinds have modules of their own, see `SURFACES`.
 
 The currents of a sensor don't change under a conformal map, so a pad is solved on its rectangle [0, a] x [0,
 b] and only the result is carried to the surface. For a surface of revolution of radius r(u) at arc length u
@@ -36,12 +35,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field._prism import PrismSurface
-from handtouch.field._revolution import RevolutionSurface
-from handtouch.field.mesh_surface import MeshSurface
-from handtouch.field.outline_surface import OutlineOnCylinder, OutlineOnSphere, OutlineSurface
 from handtouch.field.surface_base import (
-    SURFACES,
     FloatArray,
     Meridian,
     Surface,
@@ -52,22 +46,6 @@ from handtouch.field.surface_base import (
     ratio_or_one,
     surface_key,
 )
-
-__all__ = [
-    "SURFACES",
-    "AnisotropicSurface",
-    "ConeSurface",
-    "CylinderSurface",
-    "MeshSurface",
-    "OutlineOnCylinder",
-    "OutlineOnSphere",
-    "OutlineSurface",
-    "PlaneSurface",
-    "PrismSurface",
-    "RevolutionSurface",
-    "SphereSurface",
-    "Surface",
-]
 
 
 class _DevelopableSurface(SweptSurface):

@@ -1,6 +1,7 @@
 """Interface and registry of sensor surfaces, and the base class of surfaces of revolution.
 
-Public names: `Surface`, `SweptSurface`, `Meridian`, `SURFACES`, `SurfaceKey`, `surface_key`, `surface_keys`.
+Public names: `Surface`, `SweptSurface`, `Meridian`, `SURFACES`, `SurfaceKinds`, `SurfaceKey`, `surface_key`,
+`surface_keys`, `MIN_CLEARANCE`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -18,9 +20,45 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-SURFACES: dict[str, type[Surface]] = {}
-"""Surface classes by the `kind` that a deployment file names; a class that sets `kind` is entered here."""
 
+class SurfaceKinds(Mapping[str, "type[Surface]"]):
+    """Surface classes by the `kind` that a deployment file names; a class that sets `kind` is entered here.
+
+    The module of a kind of this package is imported when its class is first asked for.
+    """
+
+    def __init__(self, modules: Mapping[str, str]) -> None:
+        self._modules = modules
+        self._classes: dict[str, type[Surface]] = {}
+
+    def enter_class(self, kind: str, shape: type[Surface]) -> None:
+        """Enter a class; one of the same kind is replaced."""
+        self._classes[kind] = shape
+
+    def __getitem__(self, kind: str) -> type[Surface]:
+        if kind not in self._classes:
+            import_module(f"handtouch.field.{self._modules[kind]}")
+        return self._classes[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._modules, **self._classes})
+
+    def __len__(self) -> int:
+        return len({**self._modules, **self._classes})
+
+
+SURFACES = SurfaceKinds(
+    {
+        **dict.fromkeys(("plane", "cylinder", "cone", "sphere"), "surface"),
+        **dict.fromkeys(("outline", "outline_on_cylinder", "outline_on_sphere"), "outline_surface"),
+        "prism": "_prism",
+        "revolution": "_revolution",
+        "mesh": "mesh_surface",
+    }
+)
+
+MIN_CLEARANCE = 1e-4
+"""Shortest edge of an outline, and distance of separate edges, over its larger extent."""
 MAX_SIMILAR_END_RATIO = 0.8
 """Ratio of the ends' lengths below which one is called the narrow end."""
 _NEAREST_POINTS = 100  # along each side, among which the nearest to a place is taken
@@ -110,7 +148,7 @@ class Surface(ABC):
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "kind" in cls.__dict__:
-            SURFACES[cls.kind] = cls
+            SURFACES.enter_class(cls.kind, cls)
 
     @property
     def is_swept(self) -> bool:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.field.spline import spline_operator
-from handtouch.field.surface import PlaneSurface, Surface
+from handtouch.field.surface import PlaneSurface
+from handtouch.field.surface_base import Surface
 
 FloatArray = NDArray[np.float64]
 _INTERVALS = 64

@@ -13,14 +13,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch import config
+from handtouch import config, field
 from handtouch.config.responses import ForceLaw, ResponseTable
 from handtouch.field.channel_map import VARIATIONS, ChangedMap, ChannelMap
 from handtouch.field.contact_law import ContactLaw
-from handtouch.field.measured import MapPrior, MeasuredMap, PressTable
 from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, UnevenSheet
 
 _M_PER_MM = 1e-3
@@ -77,14 +76,16 @@ def pad_channels(pad: config.Pad, sheet: config.Sheet, node: config.Node) -> Cha
     return pad_network(pad, sheet)
 
 
-def press_map(pad: config.Pad, sheet: config.Sheet, node: config.Node, presses: PressTable) -> MeasuredMap:
+def press_map(
+    pad: config.Pad, sheet: config.Sheet, node: config.Node, presses: field.PressTable
+) -> field.MeasuredMap:
     """Return the map of a pad that presses at known places show, from what is stated of its parts on.
 
     Raises ValueError for presses of other channels.
     """
     stated = pad.model_copy(update={"press_map": None})
     theory = pad_channels(stated, sheet, node)
-    prior = MapPrior(
+    prior = field.MapPrior(
         theory,
         models_with_other_parts(theory, stated, node, sheet),
         node.gain_std,
@@ -101,7 +102,7 @@ def press_map(pad: config.Pad, sheet: config.Sheet, node: config.Node, presses: 
         )
     )
     sizes = _M_PER_MM * radius_mm, _M_PER_MM * std_mm, elongation
-    return MeasuredMap(pad_surface(pad), presses, prior, *sizes)
+    return field.MeasuredMap(pad_surface(pad), presses, prior, *sizes)
 
 
 def channel_gain_std(pad: config.Pad, node: config.Node) -> float:
@@ -134,12 +135,10 @@ def _on_film(network: ElectrodeNetwork, pad: config.Pad, sheet: config.Sheet) ->
     """Return a pad's network on its film, if its resistance was measured."""
     if pad.resistance_map is None:
         return network
-    from handtouch.field.film import UnevenNetwork  # not loaded with the package
-
     surface = pad_surface(pad)
     scale = float(surface.scale(surface.a / 2, surface.b / 2))
     radius = _M_PER_MM * sheet.contact_radius_mm / scale
-    return UnevenNetwork.on_film(network, config.film_of(pad.resistance_map), surface, radius)
+    return field.UnevenNetwork.on_film(network, config.film_of(pad.resistance_map), surface, radius)
 
 
 def sheet_law(

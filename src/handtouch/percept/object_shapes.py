@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from handtouch.config.meshes import surface_triangles
 from handtouch.config.objects import (
     BoltShape,
     BoxShape,
@@ -19,7 +20,6 @@ from handtouch.config.objects import (
     ObjectTable,
     SphereShape,
 )
-from handtouch.config.surfaces import surface_triangles
 from handtouch.hand.body_distance import squared_distance_from_triangles
 
 FloatArray = NDArray[np.float64]

@@ -15,7 +15,7 @@ from scipy.special import expit
 from handtouch import wire
 from handtouch.config import Deployment, Pad
 from handtouch.core.pad_model import contact_law, law_of, networks_of
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.hand import PadGeometry, mount_transform, pad_surface
 from handtouch.percept.messages import PerceptStatus, make_percept_message, make_request_message
 from handtouch.percept.pipeline import PerceptPipeline

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.config.surfaces import SurfaceTriangles, surface_triangles
+from handtouch.config.meshes import SurfaceTriangles, surface_triangles
 from handtouch.simulate.pad_geometry import SimulatedSurface, SurfaceProjection
 
 FloatArray = NDArray[np.float64]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from handtouch import config
     from handtouch.field.model import ChannelModel
-    from handtouch.field.surface import Surface
+    from handtouch.field.surface_base import Surface
 
     FloatArray = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from scipy.special import logsumexp
 
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import ChannelModel
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

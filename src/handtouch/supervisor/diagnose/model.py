@@ -17,7 +17,7 @@ from handtouch import config
 from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.core.pad_model import ampere_per_count_of
 from handtouch.field.model import ChannelModel, FractionModel
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.hand import (
     channel_gain_std,
     models_with_other_parts,

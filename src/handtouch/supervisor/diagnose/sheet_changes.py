@@ -16,7 +16,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import splu
 
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.supervisor.diagnose.model import FloatArray
 
 _CELLS_PER_SIDE = 40  # a side

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.field.surface import Surface
+from handtouch.field.surface_base import Surface
 from handtouch.hand.body_distance import find_mesh, load_triangles
 from handtouch.hand.urdf import BodyShape
 
