@@ -18,7 +18,7 @@ from handtouch import config
 from handtouch.config import shipped
 from handtouch.config.channels import node_channels
 from handtouch.core.columns import TickResult
-from handtouch.core.least_threshold import LevelScatter, least_begin_counts
+from handtouch.core.least_threshold import least_begin_counts
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import CountSlab, Cycle
@@ -29,6 +29,7 @@ from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, DrawnWorld, Family
+from handtouch.supervisor.level_scatter import LevelScatter
 
 FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]

@@ -38,9 +38,9 @@ from handtouch.calibration.store import (
     Store,
     StoreError,
     damaged_files,
-    store_path,
 )
 from handtouch.calibration.store_file import SCHEMA_VERSION
+from handtouch.calibration.store_path import store_path
 from handtouch.config import load, shipped
 
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)

@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch.cli import main
-from handtouch.client import keys
+from handtouch.client import key_maker, keys
 from handtouch.client.keys import KeyFileError
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    keys.make_server_keys(tmp_path / "keys", "robot1")
+    key_maker.make_server_keys(tmp_path / "keys", "robot1")
     return tmp_path / "keys"
 
 
@@ -28,8 +28,8 @@ def _mode(path: Path) -> int:
 
 
 def test_written_keys_are_loaded(folder: Path, tmp_path: Path) -> None:
-    alice = keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
-    bob = keys.add_client(folder, "bob", "control", tmp_path / "bob.key")
+    alice = key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
+    bob = key_maker.add_client(folder, "bob", "control", tmp_path / "bob.key")
     server = keys.load_server(folder)
     assert keys.load_client(tmp_path / "alice.key") == alice
     assert alice.server == server.name == "robot1"
@@ -45,8 +45,8 @@ def test_written_keys_are_loaded(folder: Path, tmp_path: Path) -> None:
 def test_secret_files_are_private_and_the_others_world_readable(folder: Path, tmp_path: Path) -> None:
     before = os.umask(0)
     try:
-        keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
-        keys.make_server_keys(tmp_path / "more", "robot2")
+        key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
+        key_maker.make_server_keys(tmp_path / "more", "robot2")
     finally:
         os.umask(before)
     assert _mode(folder / "server.key") == _mode(tmp_path / "alice.key") == 0o600
@@ -56,7 +56,7 @@ def test_secret_files_are_private_and_the_others_world_readable(folder: Path, tm
 
 
 def test_client_secrets_are_not_kept_by_the_daemon_and_not_in_repr(folder: Path, tmp_path: Path) -> None:
-    alice = keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
+    alice = key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
     kept = "".join(path.read_text() for path in folder.rglob("*") if path.is_file())
     assert alice.secret_key not in kept
     assert alice.secret_key not in repr(alice)
@@ -65,15 +65,15 @@ def test_client_secrets_are_not_kept_by_the_daemon_and_not_in_repr(folder: Path,
 
 
 def test_no_key_is_overwritten(folder: Path, tmp_path: Path) -> None:
-    keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
+    key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     before = {path: path.read_bytes() for path in files}
     with pytest.raises(KeyFileError, match="exists already"):
-        keys.make_server_keys(folder, "robot2")
+        key_maker.make_server_keys(folder, "robot2")
     with pytest.raises(KeyFileError, match="exists already"):
-        keys.add_client(folder, "alice", "control", tmp_path / "other.key")
+        key_maker.add_client(folder, "alice", "control", tmp_path / "other.key")
     with pytest.raises(KeyFileError, match="exists already"):
-        keys.add_client(folder, "carl", "control", tmp_path / "alice.key")
+        key_maker.add_client(folder, "carl", "control", tmp_path / "alice.key")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
@@ -97,7 +97,7 @@ def test_daemon_keys_accessible_to_others_are_rejected(
 
 def test_a_client_key_readable_by_others_is_rejected(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "alice.key"
-    keys.add_client(folder, "alice", "read", path)
+    key_maker.add_client(folder, "alice", "read", path)
     path.chmod(0o644)
     with pytest.raises(KeyFileError, match=f"chmod 600 {path}"):
         keys.load_client(path)
@@ -135,8 +135,8 @@ def _short(path: Path) -> None:
 def test_a_damaged_entry_authorises_no_client_and_leaves_others_valid(
     folder: Path, tmp_path: Path, damage: Callable[[Path], None], problem_text: str
 ) -> None:
-    keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
-    keys.add_client(folder, "bob", "read", tmp_path / "bob.key")
+    key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
+    key_maker.add_client(folder, "bob", "read", tmp_path / "bob.key")
     damage(folder / "clients/alice.pub")
     clients, (problem,) = keys.load_clients(folder)
     assert [client.name for client in clients.values()] == ["bob"]
@@ -145,7 +145,7 @@ def test_a_damaged_entry_authorises_no_client_and_leaves_others_valid(
 
 
 def test_one_key_under_two_names_is_reported(folder: Path, tmp_path: Path) -> None:
-    keys.add_client(folder, "alice", "read", tmp_path / "alice.key")
+    key_maker.add_client(folder, "alice", "read", tmp_path / "alice.key")
     text = (folder / "clients/alice.pub").read_text()
     (folder / "clients/zoe.pub").write_text(text.replace('"read"', '"control"'))
     clients, (problem,) = keys.load_clients(folder)
@@ -154,7 +154,7 @@ def test_one_key_under_two_names_is_reported(folder: Path, tmp_path: Path) -> No
 
 
 def test_a_secret_key_that_does_not_match_the_public_key_is_rejected(folder: Path, tmp_path: Path) -> None:
-    alice, bob = (keys.add_client(folder, name, "read", tmp_path / name) for name in ("alice", "bob"))
+    alice, bob = (key_maker.add_client(folder, name, "read", tmp_path / name) for name in ("alice", "bob"))
     path = tmp_path / "alice"
     path.write_text(path.read_text().replace(alice.secret_key, bob.secret_key))
     with pytest.raises(KeyFileError, match="are not a pair"):
@@ -209,7 +209,7 @@ def test_the_commands_make_list_and_revoke(
 @pytest.mark.parametrize("name", ["", "../alice", "a/b", ".hidden", "a b", "x" * 65, "a\n"])
 def test_a_name_cannot_lead_out_of_the_folder(folder: Path, tmp_path: Path, name: str) -> None:
     with pytest.raises(KeyFileError, match="a name consists of letters"):
-        keys.add_client(folder, name, "read", tmp_path / "new.key")
+        key_maker.add_client(folder, name, "read", tmp_path / "new.key")
     assert not (tmp_path / "new.key").exists()
 
 

@@ -10,11 +10,11 @@ from scipy.stats import norm
 
 from handtouch.core.least_threshold import (
     FALSE_CONTACT_PERIOD_S,
-    LevelScatter,
     begin_samples,
     least_begin_counts,
     level_scatter,
 )
+from handtouch.supervisor.level_scatter import LevelScatter
 from tests.core.test_contacts import BEGIN, Detector
 
 RATE_HZ = 200.0

@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from handtouch import wire
-from handtouch.client import connect, keys, request
+from handtouch.client import connect, key_maker, keys, request
 from handtouch.client.connection import Connection
 from handtouch.daemon.authentication import REFUSAL_CAUSES, Authenticator
 from handtouch.daemon.control import ControlServer
@@ -114,9 +114,9 @@ class Served:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    keys.make_server_keys(tmp_path / "keys", "robot1")
-    keys.add_client(tmp_path / "keys", "reader", "read", tmp_path / "reader.key")
-    keys.add_client(tmp_path / "keys", "pilot", "control", tmp_path / "pilot.key")
+    key_maker.make_server_keys(tmp_path / "keys", "robot1")
+    key_maker.add_client(tmp_path / "keys", "reader", "read", tmp_path / "reader.key")
+    key_maker.add_client(tmp_path / "keys", "pilot", "control", tmp_path / "pilot.key")
     return tmp_path / "keys"
 
 
@@ -138,16 +138,16 @@ def without_keys() -> Iterator[Served]:
 def foreign(tmp_path: Path, folder: Path) -> Path:
     """Return the key of a client of another daemon."""
     del folder
-    keys.make_server_keys(tmp_path / "elsewhere", "robot2")
-    keys.add_client(tmp_path / "elsewhere", "stranger", "control", tmp_path / "foreign.key")
+    key_maker.make_server_keys(tmp_path / "elsewhere", "robot2")
+    key_maker.add_client(tmp_path / "elsewhere", "stranger", "control", tmp_path / "foreign.key")
     return tmp_path / "foreign.key"
 
 
 @pytest.fixture
 def unknown(tmp_path: Path, folder: Path) -> Path:
     """Return a revoked key."""
-    keys.add_client(folder, "revoked", "control", tmp_path / "revoked.key")
-    keys.revoke(folder, "revoked")
+    key_maker.add_client(folder, "revoked", "control", tmp_path / "revoked.key")
+    key_maker.revoke(folder, "revoked")
     return tmp_path / "revoked.key"
 
 
@@ -245,12 +245,12 @@ def test_key_from_the_environment(served: Served, tmp_path: Path, monkeypatch: p
 
 
 def test_clients_are_added_and_revoked_without_restart(served: Served, folder: Path, tmp_path: Path) -> None:
-    keys.add_client(folder, "late", "read", tmp_path / "late.key")
+    key_maker.add_client(folder, "late", "read", tmp_path / "late.key")
     assert _receives(served.live, tmp_path / "late.key")
     entry = folder / "clients/late.pub"
     entry.write_text(entry.read_text().replace('"read"', '"control"'))
     request("status", endpoint=served.control.endpoint, key=tmp_path / "late.key", timeout_s=30)
-    keys.revoke(folder, "late")
+    key_maker.revoke(folder, "late")
     with pytest.raises(PermissionError):
         _receives(served.live, tmp_path / "late.key")
     assert _receives(served.live, tmp_path / "reader.key")
@@ -269,7 +269,7 @@ def test_open_connections_of_a_revoked_client_are_closed(
         served.until(lambda: asking.poll(0) and asking.readable)
         assert revoked.recv(30) is not None
         assert other.recv(30) is not None
-        keys.revoke(folder, "reader")
+        key_maker.revoke(folder, "reader")
         served.until(lambda: served.authenticator.refused["revoked"] == 2)
         with pytest.raises(PermissionError, match="rejects the key of reader"):
             list(itertools.islice(revoked, 10_000))

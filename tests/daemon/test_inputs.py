@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zmq
 
-from handtouch.client import keys
+from handtouch.client import key_maker
 from handtouch.client.robot import Robot
 from handtouch.core.sheet_force import ForceReference
 from handtouch.daemon.authentication import Authenticator
@@ -224,9 +224,9 @@ def test_robot_client_refuses_missing_values(inputs: Any) -> None:
 
 def test_with_keys_only_control_clients_may_send_inputs(tmp_path: Path) -> None:
     folder = tmp_path / "keys"
-    keys.make_server_keys(folder, "daemon")
+    key_maker.make_server_keys(folder, "daemon")
     for name, rights in (("viewer", "read"), ("arm", "control")):
-        keys.add_client(folder, name, rights, tmp_path / name)
+        key_maker.add_client(folder, name, rights, tmp_path / name)
     with zmq.Context() as context:
         authenticator = Authenticator.open(context, folder)
         made = InputReceiver.open(

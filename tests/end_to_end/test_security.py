@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from handtouch.cli import main
-from handtouch.client import connect, keys, request
+from handtouch.client import connect, key_maker, request
 from handtouch.config import shipped
 from handtouch.record.recording import Recording
 from tests.starter import Starter
@@ -112,8 +112,8 @@ def test_readable_secret_is_refused(reachable: Reachable) -> None:
 
 
 def test_each_key_grants_its_right(reachable: Reachable, tmp_path: Path) -> None:
-    keys.make_server_keys(tmp_path / "other", "robot2")
-    keys.add_client(tmp_path / "other", "stranger", "control", reachable.key("stranger"))
+    key_maker.make_server_keys(tmp_path / "other", "robot2")
+    key_maker.add_client(tmp_path / "other", "stranger", "control", reachable.key("stranger"))
     reachable.start("run")
     assert reachable.ask("pilot")["ok"]
     with connect("service", endpoint=reachable.at("live"), key=reachable.key("reader")) as messages:
@@ -126,9 +126,9 @@ def test_each_key_grants_its_right(reachable: Reachable, tmp_path: Path) -> None
     with pytest.raises(PermissionError, match="requires a key"):
         request("status", endpoint=reachable.at("control"), key="", timeout_s=START_S)
 
-    keys.add_client(reachable.keys, "late", "control", reachable.key("late"))
+    key_maker.add_client(reachable.keys, "late", "control", reachable.key("late"))
     assert reachable.ask("late")["ok"]
-    keys.revoke(reachable.keys, "late")
+    key_maker.revoke(reachable.keys, "late")
     with pytest.raises(PermissionError, match="unknown there"):
         reachable.ask("late")
     assert reachable.end("run") == 0

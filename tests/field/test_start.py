@@ -51,6 +51,9 @@ def test_daemon_and_pad_model_load_no_package_that_they_can_do_without() -> None
     loaded = set(done.stdout.split())
     assert "pydantic" in loaded
     assert not {"scipy", "matplotlib", "rich", "mcap", "tomlkit", "pyarrow"} & loaded
-    own = {"calibration.gains", "calibration.stationary_contacts", "client.subscriber", "supervisor.worker"}
-    own |= {"daemon.metrics_page", "field.residual", "percept.worker"}
+    own = {"calibration.gains", "calibration.stationary_contacts", "calibration.store", "client.key_maker"}
+    own |= {"client.subscriber", "daemon.metrics_page", "percept.action_request", "percept.estimator"}
+    own |= {"percept.worker", "supervisor.level_scatter", "supervisor.worker"}
+    own |= {f"field.{name}" for name in ("film", "measured", "mesh_surface", "outline", "outline_surface")}
+    own |= {f"field.{name}" for name in ("residual", "taxels", "triangulation", "two_layers")}
     assert not {f"handtouch.{name}" for name in own} & loaded

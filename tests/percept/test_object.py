@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch.config import ObjectTable
+from handtouch.percept.estimator import HandSnapshot
 from handtouch.percept.object_estimator import ObjectEstimator
 from handtouch.percept.object_pose import FREE_ROTATION_RAD2, PoseEvidence, PoseHypothesis, PoseSampler
 from handtouch.percept.object_shapes import KnownShape, build_shape
-from handtouch.percept.samples import ContactBuffer, ContactSamples, HandSnapshot, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 FloatArray = NDArray[np.float64]
 POINT_STD_M, NORMAL_STD_RAD = 4e-4, 0.1

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from handtouch.percept.action_request import CandidateAction, Question
+from handtouch.percept.estimator import PerceptEstimator
 from handtouch.percept.pipeline import PerceptPipeline
-from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate, PerceptEstimator
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 from handtouch.wire import PERCEPT_KINDS
 
 

@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from handtouch.percept.samples import (
-    SAMPLES_PER_CONTACT,
-    ContactBuffer,
-    ContactSamples,
-    FitSchedule,
-)
+from handtouch.percept.estimator import FitSchedule
+from handtouch.percept.samples import SAMPLES_PER_CONTACT, ContactBuffer, ContactSamples
 
 
 def sample(pads: list[int], t_ns: int, contact: int, force_n: float) -> ContactSamples:

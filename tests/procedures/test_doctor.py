@@ -18,7 +18,7 @@ import zmq
 
 from handtouch import cli, config
 from handtouch.canbus.bus.port import BusError, Port, open_bus
-from handtouch.client import keys
+from handtouch.client import key_maker
 from handtouch.config import shipped
 from handtouch.core.slab import Slab
 from handtouch.host.machine import Machine
@@ -151,8 +151,8 @@ def test_endpoint_requires_its_interface(free_port: int, host: str, state: str) 
 
 
 def test_unusable_keys_are_named(tmp_path: Path) -> None:
-    keys.make_server_keys(tmp_path / "keys", "robot1")
-    keys.add_client(tmp_path / "keys", "viewer", "read", tmp_path / "viewer.key")
+    key_maker.make_server_keys(tmp_path / "keys", "robot1")
+    key_maker.add_client(tmp_path / "keys", "viewer", "read", tmp_path / "viewer.key")
     daemon = config.Daemon(keys=str(tmp_path / "keys"))
     (keys_check,) = doctor.check_keys(daemon)
     assert (keys_check.state, "1 authorised clients" in keys_check.detail) == ("ok", True)

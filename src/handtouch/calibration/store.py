@@ -1,46 +1,24 @@
 """Calibration store: every calibration of every node, in one SQLite file; nothing is overwritten.
 
-Public: `Store`, `store_path`; `damaged_files` and errors of `store_file`. Several processes may have it open.
+Public: `Store`; `damaged_files` and errors of `store_file`. Several processes may have it open.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from handtouch.calibration import store_file
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, Provenance
 from handtouch.calibration.store_file import DamagedStoreError, StoreError, damaged_files
 
-if TYPE_CHECKING:
-    from handtouch.config import Deployment
-
-__all__ = ["DamagedStoreError", "Store", "StoreError", "damaged_files", "store_path"]
-
-
-def store_path(deployment: Deployment | None = None, folder: Path | None = None) -> Path:
-    """Return the store's path: `[daemon] store`, relative to the deployment file's folder.
-
-    Else in the state folder given by systemd, or $XDG_STATE_HOME/handtouch, or ~/.local/state/handtouch.
-    Nodes on a bus between programs are simulated, with the serial numbers of real ones: they have a store of
-    their own.
-    """
-    if deployment is not None and deployment.daemon.store is not None:
-        return (folder or Path()) / Path(deployment.daemon.store).expanduser()
-    is_simulated = deployment is not None and any(bus.is_cableless for bus in deployment.buses)
-    name = "simulated.db" if is_simulated else "calibrations.db"
-    if state_folder := os.environ.get("STATE_DIRECTORY"):
-        return Path(state_folder.split(":")[0]) / name
-    home = os.environ.get("XDG_STATE_HOME", "")
-    state = Path(home) if Path(home).is_absolute() else Path.home() / ".local" / "state"
-    return state / "handtouch" / name
+__all__ = ["DamagedStoreError", "Store", "StoreError", "damaged_files"]
 
 
 class Store:

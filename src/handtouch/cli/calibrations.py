@@ -12,7 +12,8 @@ from typing import Any
 from handtouch import config
 from handtouch.calibration import exchange
 from handtouch.calibration.calibration import Calibration, CalibrationVersion, differences
-from handtouch.calibration.store import Store, StoreError, damaged_files, store_path
+from handtouch.calibration.store import Store, StoreError, damaged_files
+from handtouch.calibration.store_path import store_path
 from handtouch.cli.options import Subparsers, add_command, add_json, add_output, integer
 from handtouch.cli.tables import make_table, output_console, print_table
 from handtouch.host.json_output import print_json

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from handtouch.cli.errors import CommandError
 from handtouch.cli.options import add_command, add_json, add_output
-from handtouch.client import keys
+from handtouch.client import key_maker, keys
 from handtouch.host.json_output import print_json
 
 
@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:
     """Create a daemon's keys, named after the host by default; exit status 0, or 2 (failed)."""
-    made = keys.make_server_keys(folder, name or platform.node())
+    made = key_maker.make_server_keys(folder, name or platform.node())
     if as_json:
         print_json({"folder": folder, "name": made.name, "public_key": made.public_key})
         return 0
@@ -70,7 +70,7 @@ def run_make(folder: Path, name: str | None, as_json: bool = False) -> int:
 def run_client(folder: Path, name: str, rights: str, file: Path | None, as_json: bool = False) -> int:
     """Create a client's keys; exit status 0, or 2 (failed)."""
     file = file or Path(f"{name}.key")
-    keys.add_client(folder, name, rights, file)
+    key_maker.add_client(folder, name, rights, file)
     if as_json:
         print_json({"file": file, "name": name, "rights": rights})
         return 0
@@ -101,6 +101,6 @@ def run_list(folder: Path, as_json: bool) -> int:
 
 def run_revoke(folder: Path, name: str) -> int:
     """Revoke a client's authorisation; exit status 0, or 2 (failed)."""
-    keys.revoke(folder, name)
+    key_maker.revoke(folder, name)
     print(f"revoked {name}; a running daemon closes its connections within a second")
     return 0

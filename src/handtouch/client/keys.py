@@ -4,8 +4,8 @@
     FOLDER/clients/NAME.pub   an authorised client: its public key and its rights
     NAME.key                  that client's own keys; secret, to be moved to the client's machine
 
-All are TOML. Public names: `make_server_keys`, `add_client`, `revoke`, `load_server`, `load_client`,
-`load_clients`.
+All are TOML. Public names: `load_server`, `load_client`, `load_clients`, `check_name`, `KeyFileError`.
+Keys are made by `key_maker`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import re
 import stat
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -60,85 +60,6 @@ class AuthorisedClient:
     name: str
     rights: str
     public_key: str
-
-
-def make_server_keys(folder: Path, name: str) -> ServerKey:
-    """Make a daemon's keys in a new folder. Raises KeyFileError; never overwrites a key."""
-    _check_name(name)
-    public, secret = _new_key_pair()
-    made = ServerKey(name, public, secret)
-    if (folder / SERVER_FILE).exists():
-        raise KeyFileError(
-            f"{folder / SERVER_FILE} exists already, and clients identify the daemon by it; "
-            "to replace it, make keys in a new folder"
-        )
-    try:
-        for path in (folder, folder / CLIENTS_FOLDER):
-            if not path.exists():
-                path.mkdir(parents=True)
-                path.chmod(0o755)  # regardless of the umask: the daemon may run as another user
-        _write_new_file(
-            folder / SERVER_FILE,
-            asdict(made),
-            "Secret keys of a daemon: readable by its user only.",
-            0o600,
-        )
-    except OSError as error:
-        raise KeyFileError(
-            f"{error.filename}: {error.strerror}; make the keys as a user with write permission there"
-        ) from error
-    return made
-
-
-def add_client(folder: Path, name: str, rights: str, file: Path) -> ClientKey:
-    """Make keys for a client: its own key file `file`, and its entry in the daemon's folder.
-
-    Raises KeyFileError; never overwrites a key.
-    """
-    _check_name(name)
-    if rights not in RIGHTS:
-        raise KeyFileError(f"rights {rights!r}: must be {' or '.join(RIGHTS)}")
-    server = load_server(folder)
-    entry = folder / CLIENTS_FOLDER / f"{name}.pub"
-    for path in (entry, file):
-        if path.exists():
-            raise KeyFileError(f"{path} exists already; revoke that client first, or choose another name")
-    public, secret = _new_key_pair()
-    made = ClientKey(name, public, secret, server.name, server.public_key)
-    try:
-        _write_new_file(
-            file,
-            asdict(made),
-            f"Secret keys of client {name} of {server.name}.",
-            0o600,
-        )
-        try:
-            _write_new_file(
-                entry,
-                {"rights": rights, "public_key": public},
-                f"Authorises {name}; revoke it by deleting this file (`handtouch keys revoke`).",
-                0o644,
-            )
-        except OSError:
-            file.unlink()
-            raise
-    except OSError as error:
-        raise KeyFileError(
-            f"{error.filename}: {error.strerror}; choose a folder with write permission"
-        ) from error
-    return made
-
-
-def revoke(folder: Path, name: str) -> None:
-    """Remove a client's authorisation. Raises KeyFileError for an unknown client or a failed removal."""
-    path = folder / CLIENTS_FOLDER / f"{name}.pub"
-    known = sorted(entry.stem for entry in (folder / CLIENTS_FOLDER).glob("*.pub"))
-    if name not in known:
-        raise KeyFileError(f"{folder} has no client {name}; its clients: {', '.join(known) or 'none'}")
-    try:
-        path.unlink()
-    except OSError as error:
-        raise KeyFileError(f"{path}: {error.strerror}; retry with write permission") from error
 
 
 def load_server(folder: Path) -> ServerKey:
@@ -191,17 +112,8 @@ def load_clients(folder: Path) -> tuple[dict[str, AuthorisedClient], list[str]]:
     return clients, problems
 
 
-def _new_key_pair() -> tuple[str, str]:
-    import zmq  # takes 0.1 s; most of this module doesn't need it
-
-    if not zmq.has("curve"):
-        raise KeyFileError("this pyzmq was built without CURVE; pip install --force-reinstall pyzmq")
-    public, secret = zmq.curve_keypair()
-    return public.decode(), secret.decode()
-
-
 def _load_client_entry(path: Path) -> AuthorisedClient:
-    _check_name(path.stem)
+    check_name(path.stem)
     try:
         _check_not_writable_by_others(path)
         values = _parse(path, path.read_bytes())
@@ -211,16 +123,6 @@ def _load_client_entry(path: Path) -> AuthorisedClient:
     if rights not in RIGHTS:
         raise KeyFileError(f"{path}: rights = {rights!r} must be {' or '.join(map(repr, RIGHTS))}")
     return AuthorisedClient(path.stem, rights, _get_key(path, values, "public_key"))
-
-
-def _write_new_file(path: Path, values: Mapping[str, str], comment: str, mode: int) -> None:
-    """Create a file atomically with its final mode. Raises FileExistsError if it exists."""
-    text = f"# {comment}\n" + "".join(f'{key} = "{value}"\n' for key, value in values.items())
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fchmod(file.fileno(), mode)
 
 
 def _read_secret(path: Path) -> bytes:
@@ -301,7 +203,8 @@ def _get_key_pair(path: Path, values: Mapping[str, Any]) -> tuple[str, str]:
     return public, secret
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Raise KeyFileError for a name that no file of keys can have."""
     if not _NAME_PATTERN.fullmatch(name):
         raise KeyFileError(
             f"{name!r}: a name consists of letters, digits, '.', '_' and '-', begins with a letter or digit "

@@ -22,7 +22,7 @@ import zmq
 from numpy.typing import NDArray
 
 from handtouch import wire
-from handtouch.calibration.store import store_path
+from handtouch.calibration.store_path import store_path
 from handtouch.canbus import cia301
 from handtouch.canbus.bus.loop_pause import LoopPause
 from handtouch.canbus.bus.port import Port

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         SphereSurface,
     )
     from handtouch.field.taxels import TaxelArray, TaxelContact, TaxelTolerances
+    from handtouch.field.triangulation import Triangulation, parse_stl
     from handtouch.field.two_layers import TwoLayers
 
 _LATER = {
@@ -48,7 +49,9 @@ _LATER = {
     "Outline": "outline",
     "PrismSurface": "_prism",
     "RevolutionSurface": "_revolution",
+    "Triangulation": "triangulation",
     "TwoLayers": "two_layers",
+    "parse_stl": "triangulation",
 }
 """Modules of the names that load them when they are used, as not every daemon needs them"""
 
@@ -82,10 +85,12 @@ __all__ = [
     "TaxelArray",
     "TaxelContact",
     "TaxelTolerances",
+    "Triangulation",
     "TwoLayers",
     "UnevenNetwork",
     "contact_stack_resistance",
     "estimate",
+    "parse_stl",
     "point_test",
     "unit_signal",
 ]

@@ -4,7 +4,7 @@ An estimator that can't decide poses a `Question`: hypotheses with their probabi
 with the outcome that each hypothesis predicts. The action with the most expected bits per cost is requested.
 
 Public names: `Question`, `CandidateAction`, `ActionRequest`, `ActionSelector`,
-`expected_information_bits`.
+`expected_information_bits`, `make_request_message`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from handtouch import wire
+from handtouch.percept.messages import make_message
 
 _HERMITE_NODES, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(33)
 _HERMITE_WEIGHTS = _HERMITE_WEIGHTS / _HERMITE_WEIGHTS.sum()
@@ -145,3 +148,24 @@ def _explain_request(question: Question, action: CandidateAction, bits: float) -
     )
     quantity = f" of {action.outcome_name}" if action.outcome_name else ""
     return f"{outcomes}{quantity}: {bits:.2f} of {open_bits:.2f} bits open"
+
+
+def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.Percept:
+    """Return the message about an action request; `seq` and `session` are 0."""
+    question, action = request.question, request.action
+    return make_message(
+        "action_request",
+        t_ns=request.request_ns,
+        hand=hand,
+        link=link,
+        contact_id=question.contact,
+        state="open",
+        label=action.kind,
+        confidence=None,
+        probabilities=dict(question.hypotheses),
+        values={**action.parameters, "expected_information_bits": request.expected_information_bits},
+        evidence={},
+        reason=request.explanation,
+        question=question.name,
+        expires_ns=request.expires_ns,
+    )

@@ -4,7 +4,7 @@ The daemon sends `wire.PerceptInput`; the process returns `wire.Percept`, whose 
 sets, and `PerceptStatus`. Each is one datagram: the two parts of a message of the wire, joined.
 `unpack_output` accepts any bytes and raises PerceptMessageError.
 
-Public names: `make_percept_message`, `make_request_message`, `pack_message`, `unpack_input`, `pack_status`,
+Public names: `make_percept_message`, `make_message`, `pack_message`, `unpack_input`, `pack_status`,
 `unpack_output`, `PerceptStatus`, `PerceptMessageError`.
 """
 
@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import msgpack
 
 from handtouch import wire
-from handtouch.percept.action_request import ActionRequest
 from handtouch.percept.samples import PerceptEstimate
 
 _SEPARATOR = b"\0"
@@ -38,7 +37,7 @@ class PerceptStatus(NamedTuple):
 
 def make_percept_message(percept: PerceptEstimate, hand: str, link: str) -> wire.Percept:
     """Return the message about an estimate; `seq` and `session` are 0."""
-    return _make_message(
+    return make_message(
         percept.kind,
         t_ns=percept.estimate_ns,
         hand=hand,
@@ -55,28 +54,8 @@ def make_percept_message(percept: PerceptEstimate, hand: str, link: str) -> wire
     )
 
 
-def make_request_message(request: ActionRequest, hand: str, link: str) -> wire.Percept:
-    """Return the message about an action request; `seq` and `session` are 0."""
-    question, action = request.question, request.action
-    return _make_message(
-        "action_request",
-        t_ns=request.request_ns,
-        hand=hand,
-        link=link,
-        contact_id=question.contact,
-        state="open",
-        label=action.kind,
-        confidence=None,
-        probabilities=dict(question.hypotheses),
-        values={**action.parameters, "expected_information_bits": request.expected_information_bits},
-        evidence={},
-        reason=request.explanation,
-        question=question.name,
-        expires_ns=request.expires_ns,
-    )
-
-
-def _make_message(kind: Any, **fields: Any) -> wire.Percept:
+def make_message(kind: Any, **fields: Any) -> wire.Percept:
+    """Return a message of a kind of percept; `seq` and `session` are 0."""
     experimental = kind in wire.EXPERIMENTAL_PERCEPTS
     header: dict[str, Any] = {"v": wire.SCHEMA_VERSION, "session": 0, "seq": 0, "retained": False}
     return wire.Percept(**header, kind=kind, experimental=experimental, **fields)

@@ -23,6 +23,7 @@ from handtouch import wire
 from handtouch.config.objects import ObjectTable
 from handtouch.hand.rotations import rotation_matrices
 from handtouch.percept.action_request import Question
+from handtouch.percept.estimator import HandSnapshot, PerceptEstimator
 from handtouch.percept.object_pose import (
     MAX_CONTACT_COST,
     MAX_OUTLIERS,
@@ -33,13 +34,7 @@ from handtouch.percept.object_pose import (
 )
 from handtouch.percept.object_questions import object_questions
 from handtouch.percept.object_shapes import KnownShape, build_shape
-from handtouch.percept.samples import (
-    ContactBuffer,
-    ContactSamples,
-    HandSnapshot,
-    PerceptEstimate,
-    PerceptEstimator,
-)
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -21,14 +21,9 @@ from handtouch.field import estimate
 from handtouch.field.model import ForwardModel
 from handtouch.percept.action_request import CandidateAction, Question
 from handtouch.percept.classify import ShapeClassification, classify_touches
+from handtouch.percept.estimator import FitSchedule, PerceptEstimator
 from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior, Touches
-from handtouch.percept.samples import (
-    ContactBuffer,
-    ContactSamples,
-    FitSchedule,
-    PerceptEstimate,
-    PerceptEstimator,
-)
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 FloatArray = NDArray[np.float64]
 

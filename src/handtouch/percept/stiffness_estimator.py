@@ -21,13 +21,8 @@ from typing import NamedTuple
 import numpy as np
 
 from handtouch.field import ContactLaw
-from handtouch.percept.samples import (
-    ContactBuffer,
-    ContactSamples,
-    IntArray,
-    PerceptEstimate,
-    PerceptEstimator,
-)
+from handtouch.percept.estimator import PerceptEstimator
+from handtouch.percept.samples import ContactBuffer, ContactSamples, IntArray, PerceptEstimate
 
 _MIN_GROWTH = 3.0
 """Greatest over least force of a contact: the radius then grows by 1.44 under a round tip, and not at all

@@ -17,15 +17,11 @@ from handtouch.config import Deployment, Pad
 from handtouch.core.pad_model import contact_law, law_of, networks_of
 from handtouch.field.surface_base import Surface
 from handtouch.hand import PadGeometry, mount_transform, pad_surface
-from handtouch.percept.messages import PerceptStatus, make_percept_message, make_request_message
+from handtouch.percept.action_request import make_request_message
+from handtouch.percept.estimator import HandSnapshot
+from handtouch.percept.messages import PerceptStatus, make_percept_message
 from handtouch.percept.pipeline import PerceptPipeline
-from handtouch.percept.samples import (
-    SAMPLE_FIELDS,
-    ContactBuffer,
-    ContactSamples,
-    HandSnapshot,
-    PerceptEstimate,
-)
+from handtouch.percept.samples import SAMPLE_FIELDS, ContactBuffer, ContactSamples, PerceptEstimate
 from handtouch.percept.shape import pair_distance
 from handtouch.percept.stiffness_estimator import ExpectedRadius
 from handtouch.wire import PERCEPT_KINDS

@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.config.meshes import SurfaceTriangles, surface_triangles
+from handtouch.config.meshes import surface_triangles
 from handtouch.simulate.pad_geometry import SimulatedSurface, SurfaceProjection
+
+if TYPE_CHECKING:
+    from handtouch.config.meshes import SurfaceTriangles
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

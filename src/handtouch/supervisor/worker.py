@@ -33,7 +33,7 @@ from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.calibration.store_schedule import StoreSchedule, restored_sheet
 from handtouch.config import Deployment
-from handtouch.core.least_threshold import LevelScatter, least_begin_counts
+from handtouch.core.least_threshold import least_begin_counts
 from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id_of, noise_counts_of
 from handtouch.field.model import ChannelModel
 from handtouch.hand import (
@@ -59,6 +59,7 @@ from handtouch.supervisor.ipc import (
     WorkerMessage,
     WorkerStatus,
 )
+from handtouch.supervisor.level_scatter import LevelScatter
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 from handtouch.wire.status import PadState

@@ -18,7 +18,7 @@ from datetime import datetime
 from pathlib import Path
 
 from handtouch import config
-from handtouch.calibration.store import store_path
+from handtouch.calibration.store_path import store_path
 from handtouch.core.pad_model import default_calibration_id_of, law_of
 from handtouch.hand.urdf import read_urdf
 from handtouch.host.installation import extra_command
