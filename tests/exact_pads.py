@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from handtouch.core.pad_model import PadModel, contact_law
 from handtouch.field import ForceEstimate, PointEstimate, estimate
 from handtouch.field.model import ChannelModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.hand import PadGeometry, mount_transform, pad_surface
+from handtouch.hand import mount_transform, pad_surface
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.intp]
@@ -70,6 +70,21 @@ class ExactNetworks:
             yield pad, np.flatnonzero(first == pad)
 
 
+class LinkContacts(NamedTuple):
+    """Contacts (k,) in the frames of their links."""
+
+    position_m: FloatArray
+    """(k, 3)"""
+    normal: FloatArray
+    """(k, 3), unit vectors, outward"""
+    covariance_m2: FloatArray
+    """(k, 3, 3) of position_m; singular along the normal, because a contact lies on the surface"""
+    pad_m: FloatArray
+    """(k, 2) arc lengths from the electrodes x0 and y0"""
+    scale_m_per_unit: FloatArray
+    """(k,) metres on the surface per unit of the rectangle"""
+
+
 class ExactPads(ExactNetworks):
     """The same with surfaces, mounts and contact laws."""
 
@@ -79,8 +94,24 @@ class ExactPads(ExactNetworks):
         self._pads = [pad for _, pad in deployment.pads]
         self._sheets = [deployment.sheets[pad.sheet] for pad in self._pads]
         self._drive_v = [deployment.nodes[pad.node].drive_v for pad in self._pads]
-        geometry = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in self._pads])
-        self.to_link_frame = geometry.to_link_frame
+
+    def to_link_frame(
+        self, index: ArrayLike, x: ArrayLike, y: ArrayLike, covariance: FloatArray
+    ) -> LinkContacts:
+        """Return contacts at (x, y) (k,) with covariance (k, 2, 2) on pads `index` (k,)."""
+        contacts = zip(np.asarray(index).tolist(), np.asarray(x), np.asarray(y), covariance, strict=True)
+        return LinkContacts(*map(np.array, zip(*(self._placed(*one) for one in contacts), strict=True)))
+
+    def _placed(self, pad: int, x: float, y: float, covariance: FloatArray) -> LinkContacts:
+        surface, (rotation, translation) = pad_surface(self._pads[pad]), mount_transform(self._pads[pad])
+        tangents = (surface.tangents(x, y) * surface.scales(x, y)[:, None]) @ rotation.T
+        return LinkContacts(
+            rotation @ surface.point(x, y) + translation,
+            rotation @ surface.normal(x, y),
+            tangents.T @ covariance @ tangents,
+            np.array(surface.from_rectangle(x, y)),
+            surface.scale(x, y),
+        )
 
     def position_m(self, index: ArrayLike, x: ArrayLike, y: ArrayLike) -> FloatArray:
         """Return positions (k, 3) of points in the frames of their links [m]."""

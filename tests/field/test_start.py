@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 
 import numpy as np
-import pytest
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from scipy.special import i0e, i1e
 
 from handtouch.field.contact_stack import bessel_ratio
-from handtouch.field.spline import spline_operator
 from handtouch.hand.pads import rotation_from_rpy
-
-
-@pytest.mark.parametrize("cells", [8, 64])
-@pytest.mark.parametrize("degree", [3, 5])
-def test_splines_equal_those_of_scipy(cells: int, degree: int) -> None:
-    spline = make_interp_spline(np.arange(cells + 1.0), np.eye(cells + 1), k=degree)
-    left = np.arange(float(cells))
-    expected = np.stack([spline(left, nu=k) / math.factorial(k) for k in range(degree + 1)], axis=1)
-    np.testing.assert_allclose(spline_operator(cells, degree), expected, rtol=0, atol=1e-9)
 
 
 def test_bessel_ratio_equals_that_of_scipy() -> None:

@@ -97,10 +97,7 @@ def grasp_matrix(position_m: FloatArray, normal: FloatArray) -> FloatArray:
     A contact's three columns are unit forces along the normal and two tangents that complete a right-handed
     frame.
     """
-    axes = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, axes)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    basis = np.stack([normal, first, np.cross(normal, first)], axis=1)  # (n, 3 directions, 3)
+    basis = _axes(normal, np.zeros_like(normal)).transpose(0, 2, 1)  # (n, 3 directions, 3)
     moments = np.cross(position_m[:, None, :], basis)
     return np.asarray(np.concatenate([basis, moments], axis=2).reshape(-1, 6).T)
 

@@ -34,7 +34,6 @@ from handtouch.field.contact_stack import stack_factor
 from handtouch.field.model import ChannelModel
 from handtouch.hand import (
     MountUncertainty,
-    PadGeometry,
     channel_gain_std,
     mount_transform,
     network_parameters,
@@ -452,8 +451,8 @@ class PadModel:
         networks = self.networks
         x, y = np.array([(net.a / 2, net.b / 2) for net in networks]).T
         pads = np.arange(self.size)
-        placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad, _, _ in self._parts])
-        scale = placement.to_link_frame(pads, x, y, np.zeros((self.size, 2, 2))).scale_m_per_unit
+        surfaces = [pad_surface(pad) for pad, _, _ in self._parts]
+        scale = np.array([float(surface.scale(*at)) for surface, *at in zip(surfaces, x, y, strict=True)])
         radius = np.array([net.spreading_radius(*at) for net, *at in zip(networks, x, y, strict=True)])
         fractions = np.zeros((self.channels, self.size))
         fractions.T[self._used] = np.concatenate(

@@ -339,10 +339,6 @@ class AnisotropicSurface(Surface):
     def extent_m(self) -> tuple[float, float]:
         return self.surface.extent_m
 
-    @property
-    def is_swept(self) -> bool:
-        return self.surface.is_swept
-
     def grid_lines(self, cells: int) -> tuple[FloatArray, FloatArray]:
         x, y = self.surface.grid_lines(cells)
         return x * self._stretch, y

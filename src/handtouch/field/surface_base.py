@@ -150,11 +150,6 @@ class Surface(ABC):
         if "kind" in cls.__dict__:
             SURFACES.enter_class(cls.kind, cls)
 
-    @property
-    def is_swept(self) -> bool:
-        """True if the surface is a profile swept about an axis, so that one table along x describes it."""
-        return False
-
     @classmethod
     def from_keys(cls, values: Mapping[str, Any]) -> Surface:
         """Return the surface with the values of a deployment file, in the file's units, by key."""
@@ -300,10 +295,6 @@ class Surface(ABC):
 
 class SweptSurface(Surface):
     """A meridian swept round an axis; the plane is the case of curvature zero."""
-
-    @property
-    def is_swept(self) -> bool:
-        return True
 
     @property
     @abstractmethod

@@ -2,10 +2,9 @@
 
 Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_channels`,
 `pad_network`, `press_map`, `channel_gain_std`, `models_with_other_parts`, `part_stds`,
-`part_limits`, `PadGeometry`, `LinkContacts`.
+`part_limits`.
 """
 
-from handtouch.hand.pad_geometry import LinkContacts, PadGeometry
 from handtouch.hand.pads import (
     MountUncertainty,
     channel_gain_std,
@@ -21,9 +20,7 @@ from handtouch.hand.pads import (
 )
 
 __all__ = [
-    "LinkContacts",
     "MountUncertainty",
-    "PadGeometry",
     "channel_gain_std",
     "electrode_network",
     "models_with_other_parts",

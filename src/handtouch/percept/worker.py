@@ -6,7 +6,6 @@ Public name: `PerceptWorker`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +14,7 @@ from scipy.special import expit
 from handtouch import wire
 from handtouch.config import Deployment, Pad
 from handtouch.core.pad_model import contact_law, law_of, networks_of
-from handtouch.field.surface_base import Surface
-from handtouch.hand import PadGeometry, mount_transform, pad_surface
+from handtouch.hand import mount_transform, pad_surface
 from handtouch.percept.action_request import make_request_message
 from handtouch.percept.estimator import HandSnapshot
 from handtouch.percept.messages import PerceptStatus, make_percept_message
@@ -26,6 +24,7 @@ from handtouch.percept.shape import pair_distance
 from handtouch.percept.stiffness_estimator import ExpectedRadius
 from handtouch.wire import PERCEPT_KINDS
 
+FloatArray = NDArray[np.float64]
 _COLUMNS = wire.COLUMNS[wire.PerceptInput]
 _FIELDS = tuple(name for name in SAMPLE_FIELDS if name in _COLUMNS and name != "pad_noise_m2")
 _SURFACE_GRID = (0.06, 0.35, 0.65, 0.94)
@@ -47,17 +46,17 @@ class PerceptWorker:
         self._rows = {hand: np.flatnonzero([name == hand for name in names]) for hand in self._hands}
         self._links = [pad.link for pad in pads]
         self._networks = networks_of(deployment)
-        self._placement = PadGeometry([(pad_surface(pad), *mount_transform(pad)) for pad in pads])
+        self._surfaces = [pad_surface(pad) for pad in pads]
+        self._mounts = [mount_transform(pad) for pad in pads]
         self.contacts = ContactBuffer(n, [self._hands.index(name) for name in names])
         """latest samples of every contact"""
         shear_pads = np.array([pad.shear is not None for pad in pads], np.bool_)
-        surfaces = [pad_surface(pad) for pad in pads]
         self._pipeline = PerceptPipeline.build(
             self.contacts,
             self.pair_distance_m,
             shear_pads,
-            self._surface_points(surfaces),
-            np.array([surface.extent_m for surface in surfaces]),
+            self._surface_points(),
+            np.array([surface.extent_m for surface in self._surfaces]),
             [_expected_radius(deployment, pad) for pad in pads],
         )
         self._requested = np.zeros(n, dtype=np.uint8)
@@ -108,7 +107,7 @@ class PerceptWorker:
         step = 0.02 * min(network.a, network.b)
         offset = step * np.array([0.0, 1.0])
         xs, ys = x + offset * (residual >= 0), y + offset * (residual < 0)
-        placed = self._placement.to_link_frame(np.full(2, pad), xs, ys, np.zeros((2, 2, 2))).position_m
+        placed = self._positions_m(pad, xs, ys)
         scale = float(np.linalg.norm(placed[1] - placed[0])) / step
         return scale * distance, scale * std
 
@@ -162,14 +161,18 @@ class PerceptWorker:
             message.known_object,
         )
 
-    def _surface_points(self, surfaces: Sequence[Surface]) -> NDArray[np.float64]:
+    def _positions_m(self, row: int, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return points (k, 3) of a pad's surface in its link's frame."""
+        rotation, translation = self._mounts[row]
+        return np.asarray((rotation @ self._surfaces[row].point(x, y)).T + translation)
+
+    def _surface_points(self) -> FloatArray:
         """Return points over each pad's surface (n, f, 3) in its link's frame; its centre where one is off
         it."""
         x, y = (part.ravel() for part in np.meshgrid(_SURFACE_GRID, _SURFACE_GRID))
         found = []
-        for row, surface in enumerate(surfaces):
-            pads, none = np.full(len(x), row), np.zeros((len(x), 2, 2))
-            placed = self._placement.to_link_frame(pads, x * surface.a, y * surface.b, none).position_m
+        for row, surface in enumerate(self._surfaces):
+            placed = self._positions_m(row, x * surface.a, y * surface.b)
             off = ~np.isfinite(placed).all(axis=1)
             placed[off] = placed[len(x) // 2]
             found.append(placed)

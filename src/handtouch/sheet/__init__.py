@@ -26,11 +26,8 @@ from handtouch.sheet.fluctuation import Fluctuation, FluctuationState
 from handtouch.sheet.hysteresis import PrandtlIshlinskii
 from handtouch.sheet.presets import (
     S1,
-    S1_BENCH,
     S2,
-    S2_BENCH,
     UNKNOWN,
-    BenchCircuit,
 )
 
 __all__ = [
@@ -38,15 +35,12 @@ __all__ = [
     "BANK_MODELS",
     "BANK_WINDOW",
     "S1",
-    "S1_BENCH",
     "S2",
-    "S2_BENCH",
     "UNKNOWN",
     "Adaptation",
     "AdaptationState",
     "BankPrior",
     "BankState",
-    "BenchCircuit",
     "CompensatorState",
     "Creep",
     "Fluctuation",
