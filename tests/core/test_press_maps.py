@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,9 @@ def true_network() -> ElectrodeNetwork:
     """The first pad with other gaps than stated."""
     deployment = two_finger()
     entry = deployment.pads[0]
-    offsets = 1e-3 * np.array([[0.4, -0.2], [-0.4, 0.3], [0.3, 0.3], [-0.3, 0.1]])
-    return electrode_network(entry.pad, deployment.sheet_of(entry.pad), offsets, 0.05)
+    offsets = ((0.4, -0.2), (-0.4, 0.3), (0.3, 0.3), (-0.3, 0.1))
+    pad = entry.pad.model_copy(update={"gap_offsets_mm": offsets})
+    return electrode_network(pad, deployment.sheet_of(pad)).stretched(math.exp(0.05))
 
 
 def sheet_signals(network: ElectrodeNetwork, at: FloatArray, seed: int) -> FloatArray:

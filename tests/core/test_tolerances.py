@@ -45,10 +45,15 @@ def other_network(
 ) -> ElectrodeNetwork:
     """Return the network of a pad with other parts."""
     pad = deployment.pads[row].pad
-    ohm = tuple((np.array(pad.series_ohm) * np.exp(log_series)).tolist())
+    changed = {
+        "series_ohm": tuple((np.array(pad.series_ohm) * np.exp(log_series)).tolist()),
+        "gap_offsets_mm": tuple(
+            map(tuple, np.broadcast_to(1e3 * np.asarray(gap_offsets_m), (4, 2)).tolist())
+        ),
+    }
     sheet = deployment.sheets[pad.sheet]
     sheet = sheet.model_copy(update={"ohm_per_square": sheet.ohm_per_square * np.exp(log_sheet)})
-    return electrode_network(pad.model_copy(update={"series_ohm": ohm}), sheet, gap_offsets_m, log_aspect)
+    return electrode_network(pad.model_copy(update=changed), sheet).stretched(float(np.exp(log_aspect)))
 
 
 def drawn_network(deployment: Deployment, row: int, rng: np.random.Generator) -> ElectrodeNetwork:

@@ -37,9 +37,10 @@ def test_new_contact_starts_with_an_empty_window() -> None:
         stream.add_samples(sample([0], k, 1, 1.0))
     stream.add_samples(sample([0], 10, 2, 5.0))
     assert stream.window(0, "force_n").tolist() == [5.0]
-    assert np.isnan(stream.latest_field(np.array([0]), "force_n", back=1)).all()
+    assert stream.latest_field(np.array([0, 1]), "force_n").tolist()[0] == 5.0
     stream.end_contacts(np.array([0]))
     assert len(stream.window(0, "force_n")) == 0
+    assert np.isnan(stream.latest_field(np.array([0]), "force_n")).all()
 
 
 def test_unknown_fields_are_nan() -> None:

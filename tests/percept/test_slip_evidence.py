@@ -164,7 +164,8 @@ def relative_to_body(
     then = round(window_s / PERIOD_S)
 
     def field(name: str, of: int, back: int = 0) -> FloatArray:
-        return np.asarray(buffer.latest_field(np.array([of]), name, back)[0])
+        values = buffer.window(of, name)
+        return values[-1 - back] if back < len(values) else np.full(values.shape[1:], np.nan)
 
     def way(of: int) -> FloatArray:
         turned = field("palm_rotation", of, then) @ (field("position_m", of) - field("position_m", of, then))

@@ -155,28 +155,22 @@ def sheet_law(
     )
 
 
-def electrode_network(
-    pad: config.Pad, sheet: config.Sheet, gap_offsets_m: ArrayLike = 0.0, log_aspect: float = 0.0
-) -> ElectrodeNetwork:
+def electrode_network(pad: config.Pad, sheet: config.Sheet) -> ElectrodeNetwork:
     """Return the four electrodes of a pad on its rectangle, with the bare corners as measured on the surface.
 
-    Raises ValueError for a pad with electrodes on arcs of its outline, which has a `pad_network` only.
-
-    gap_offsets_m: added to the gap at each end of the electrodes, broadcast to (4, 2); a gap below 0 counts
-    as 0. log_aspect: logarithm of a factor of the rectangle's length along x, electrodes included.
+    A gap below 0 counts as 0. Raises ValueError for a pad with electrodes on arcs of its outline, which has a
+    `pad_network` only.
     """
     if pad.arcs_mm:
         raise ValueError(f"{pad.link}: not supported for electrodes on arcs (electrode_arcs_mm)")
     surface = pad_surface(pad)
-    gaps_m = np.maximum(np.array(pad.gaps_mm) * _M_PER_MM + np.broadcast_to(gap_offsets_m, (4, 2)), 0.0)
-    stretch = math.exp(log_aspect)
-    electrodes = []
-    for side, (low_m, high_m) in zip(SIDES, gaps_m.tolist(), strict=True):
-        factor = stretch if side in ("y0", "yb") else 1.0
-        start, stop = surface.electrode_span(side, low_m, high_m)
-        electrodes.append(Electrode(side, factor * start, factor * stop))
+    gaps_m = np.maximum(np.array(pad.gaps_mm) * _M_PER_MM, 0.0).tolist()
+    electrodes = [
+        Electrode(side, *surface.electrode_span(side, *ends))
+        for side, ends in zip(SIDES, gaps_m, strict=True)
+    ]
     network = ElectrodeNetwork.from_sides(
-        stretch * surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
+        surface.a, surface.b, electrodes, sheet.ohm_per_square, pad.series_ohm
     )
     return _on_film(network, pad, sheet)
 

@@ -123,13 +123,11 @@ class ContactBuffer:
         values = self.values[pad, stop - k : stop, FIELD_SLICES[name]]
         return np.asarray(values.reshape(k, *SAMPLE_FIELDS[name]))
 
-    def latest_field(self, pads: IntArray, name: str, back: IntArray | int = 0) -> FloatArray:
-        """Return a field of the last sample of each pad (k, ...), or of `back` samples earlier; NaN if
-        missing.
-        """
-        at = (self.sample_count[pads] - 1 - back) % self.length
+    def latest_field(self, pads: IntArray, name: str) -> FloatArray:
+        """Return a field of the last sample of each pad (k, ...); NaN if missing."""
+        at = (self.sample_count[pads] - 1) % self.length
         values = self.values[pads, at, FIELD_SLICES[name]]
-        values[self.sample_count[pads] <= back] = np.nan
+        values[self.sample_count[pads] == 0] = np.nan
         return np.asarray(values.reshape(len(pads), *SAMPLE_FIELDS[name]))
 
 
