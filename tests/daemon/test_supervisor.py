@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handtouch import wire
-from handtouch.calibration.calibration import CalibrationState
+from handtouch.calibration.calibration import CalibrationState, LawParameters
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
 from handtouch.config import Behaviour
@@ -20,7 +20,6 @@ from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
-    ContactLawMessage,
     ManualCalibration,
     SampleBlock,
     WorkerMessage,
@@ -408,7 +407,7 @@ def test_a_new_sheet_on_the_same_node_sets_aside_what_the_old_one_taught(bench: 
     fresh = rig.pipeline.tick.sheet_force.learned_of(0)
     learned, deployed = fresh.copy(), rig.pipeline.calibrations[0].law
     learned[1:5] = -3.0
-    law = ContactLawMessage(
+    law = LawParameters(
         contact_ohm_mm2=21_000.0, alpha=1.2, ohm_per_square=2000.0, covariance=((0.0,) * 3,) * 3
     )
     rig.receive(calibrate(0, 11, back_n=0.2, learned=tuple(learned), law=law))

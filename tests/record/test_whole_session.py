@@ -33,7 +33,6 @@ from handtouch.record.recording import RecordedMessage, Recording
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
-    ContactLawMessage,
     WorkerMessage,
     pack_message,
 )
@@ -160,7 +159,7 @@ def entries(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedMessage]:
     hand, pipeline = session.hand, session.pipeline
     session.set_scene("position", "force")
     session.stroke(60, 1)
-    law = ContactLawMessage(
+    law = LawParameters(
         contact_ohm_mm2=2.2e4,
         alpha=1.4,
         ohm_per_square=2500.0,

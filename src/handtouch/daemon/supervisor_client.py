@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.calibration.calibration import LawParameters, LearnedParts, channel_values
+from handtouch.calibration.calibration import LearnedParts, channel_values
 from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.master import Master
 from handtouch.canbus.nodes.spec import NodeEvent, SerialChanged
@@ -33,7 +33,6 @@ from handtouch.daemon.excitation import ExcitationSchedule
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
-    ContactLawMessage,
     ManualCalibration,
     NodeSerials,
     WorkerMessage,
@@ -271,7 +270,6 @@ class SupervisorClient:
             count = self._channels(pad)
             covariance = self._pipeline.model.gain_covariance[pad, :count, :count]
         calibration = self._pipeline.calibrations[pad]
-        law, second = calibration.law, calibration.second_law
         message = CalibrationUpdate(
             pad=pad,
             serial=serial,
@@ -280,8 +278,8 @@ class SupervisorClient:
             covariance=tuple(covariance.ravel().tolist()),
             parts=self._parts[pad],
             offset_counts=channel_values(offset_counts) if offset_counts is not None else None,
-            law=ContactLawMessage(**asdict(law)) if law is not None and "law" in given else None,
-            second_law=ContactLawMessage(**asdict(second)) if second is not None and "law" in given else None,
+            law=calibration.law if "law" in given else None,
+            second_law=calibration.second_law if "law" in given else None,
         )
         if {"gains", "law"} & given:  # the supervisor process confirms these
             self._unconfirmed_calibrations[pad] = message.calibration_id
@@ -361,10 +359,6 @@ class SupervisorClient:
             self._manual_parts.pop(pad, None)
         before = pipeline.calibrations[pad]
         kept = pipeline.model.default_calibration(pad) if message.new_sheet else before
-        laws = [
-            own if new is None else LawParameters(**new.model_dump())
-            for own, new in ((kept.law, message.law), (kept.second_law, message.second_law))
-        ]
         self._log_gain_covariance[pad], self._parts[pad] = None, message.parts
         if message.covariance is not None:
             self._log_gain_covariance[pad] = np.reshape(message.covariance, (len(message.gains), -1))
@@ -372,8 +366,8 @@ class SupervisorClient:
             before,
             calibration_id=message.calibration_id,
             gains=message.gains,
-            law=laws[0],
-            second_law=laws[1],
+            law=message.law or kept.law,
+            second_law=message.second_law or kept.second_law,
         )
         self._set_calibration(pad, calibration, before.quarantined)
         if message.new_sheet:

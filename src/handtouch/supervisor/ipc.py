@@ -21,6 +21,7 @@ from handtouch.calibration.calibration import (
     MIN_GAIN,
     CalibrationState,
     ChannelValues,
+    LawParameters,
     LearnedParts,
 )
 from handtouch.config import Table
@@ -34,7 +35,6 @@ MAX_TEXT = 1000
 """Number of characters of a text in a message."""
 FloatArray = NDArray[np.float64]
 ShortText = Annotated[str, Field(max_length=MAX_TEXT)]
-FloatTriple = tuple[float, float, float]
 GainFactor = Annotated[float, Field(ge=MIN_GAIN, le=MAX_GAIN)]
 PositiveFloat = Annotated[float, Field(gt=0)]
 Serial = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -106,16 +106,6 @@ class WorkerStatus(Table):
     store_error: ShortText = ""
 
 
-class ContactLawMessage(Table):
-    """`LawParameters` in a message."""
-
-    contact_ohm_mm2: PositiveFloat
-    alpha: PositiveFloat
-    ohm_per_square: PositiveFloat
-    covariance: tuple[FloatTriple, FloatTriple, FloatTriple]
-    hertz_force_n: PositiveFloat | None = None
-
-
 class CalibrationUpdate(Table):
     """Calibration to apply to a pad, as long as its node has this serial number.
 
@@ -136,8 +126,8 @@ class CalibrationUpdate(Table):
     parts: LearnedParts | None = None
     offset_counts: ChannelValues | None = None
     offset_std: ChannelValues | None = None
-    law: ContactLawMessage | None = None
-    second_law: ContactLawMessage | None = None
+    law: LawParameters | None = None
+    second_law: LawParameters | None = None
     back_n: Annotated[float, Field(ge=0)] | None = None
     back_std_n: Annotated[float, Field(ge=0)] = 0.0
     learned: tuple[float, ...] = ()

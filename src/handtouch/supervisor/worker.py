@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
@@ -50,7 +50,6 @@ from handtouch.supervisor.ipc import (
     MAX_TEXT,
     CalibrationAssessment,
     CalibrationUpdate,
-    ContactLawMessage,
     DaemonMessage,
     FloatArray,
     ManualCalibration,
@@ -394,7 +393,7 @@ class SupervisorWorker:
             self._store_schedule.reset_pad(pad)  # what is due is of the old sheet
         for name in ("law", "second_law"):
             if law := getattr(known, name):
-                found[name] = ContactLawMessage.model_validate(asdict(law))
+                found[name] = law
         if sheet := restored_sheet(version, age_s(version, now)):
             found |= sheet._asdict()
         return update.model_copy(update=found)
