@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import Estimates, EstimateScore, laplace_covariance
-from handtouch.field import ElectrodeNetwork, Rectangle, point_test
+from handtouch.field import ElectrodeNetwork, Rectangle
 from handtouch.field.model import ForwardModel
 
 FloatArray = NDArray[np.float64]
@@ -89,13 +89,13 @@ def efficiency(trials: int) -> list[dict[str, Any]]:
 
 
 def false_alarms(trials: int) -> list[dict[str, Any]]:
-    """Rate at which a point fails the test, against the configured rate."""
+    """Rate at which the residual of a point is beyond a limit, against that of a normal number."""
     pad, rows = Rectangle(1.77, 1.0), []
     for part, noise in enumerate((1e-4, 1e-3, 1e-2)):
         sigma, scores, batches = np.full(4, noise), [], trials // BATCH
         for seed in range(part * batches, (part + 1) * batches):
             currents = noisy(pad, sigma, BATCH, 100 + seed)[2]
-            scores.append(np.abs(point_test(pad, currents, noise).score))
+            scores.append(np.sqrt(pad.estimate(currents, noise).chi_squared))
         score = np.concatenate(scores)
         row: dict[str, Any] = {"noise": noise, "trials": trials}
         for rate in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import ndtri
 
 from handtouch.field import (
+    ElectrodeNetwork,
     ForwardModel,
     Rectangle,
     estimate,
@@ -169,3 +173,15 @@ def test_excluded_dead_channel_has_no_effect() -> None:
     noise = [1e-3, np.inf, 1e-3, 1e-3]
     found = pad.estimate(currents, noise)
     np.testing.assert_allclose([found.x, found.y], [0.4, 0.6], atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("pad", [Rectangle(1.0, 1.0), ElectrodeNetwork(1.5, 1.0, 0.03, 2400.0)])
+def test_the_residual_of_points_is_a_normal_number(noise: float, pad: Rectangle | ElectrodeNetwork) -> None:
+    """Its square is chi_squared, by which a pair is told from a point."""
+    count, rng = 40_000, np.random.default_rng(11)
+    x, y = rng.uniform(0.05, 0.95, (2, count)) * np.array([[pad.a], [pad.b]])
+    found = pad.estimate(pad.fractions(x, y) + noise * rng.normal(size=(4, count)), noise)
+    for rate in (1e-1, 1e-2, 1e-3):
+        alarms = int((np.sqrt(found.chi_squared) > -ndtri(rate / 2)).sum())
+        assert abs(alarms - rate * count) < 4.5 * math.sqrt(rate * count)

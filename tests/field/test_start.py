@@ -42,5 +42,5 @@ def test_daemon_and_pad_model_load_no_package_that_they_can_do_without() -> None
     own |= {"client.subscriber", "daemon.metrics_page", "percept.action_request", "percept.estimator"}
     own |= {"percept.worker", "supervisor.level_scatter", "supervisor.worker"}
     own |= {f"field.{name}" for name in ("film", "measured", "mesh_surface", "outline", "outline_surface")}
-    own |= {f"field.{name}" for name in ("residual", "taxels", "triangulation", "two_layers")}
+    own |= {f"field.{name}" for name in ("taxels", "triangulation", "two_layers")}
     assert not {f"handtouch.{name}" for name in own} & loaded

@@ -24,7 +24,7 @@ SMOOTH_POWER = 24
 """The worst value is approached by this norm, which has derivatives everywhere."""
 _MIN_FRACTION = 1e-12
 PAIR_SCORE = NormalDist().inv_cdf(1 - 0.5e-3) + NormalDist().inv_cdf(0.9)
-"""Score at which `point_test` detects a pair with probability 0.9, at a false-alarm rate of 1e-3."""
+"""Residual, in standard deviations, that shows a pair with probability 0.9, at a false-alarm rate of 1e-3."""
 _SIDES = {"y0": 0, "xa": 1, "yb": 2, "x0": 3}  # channels of a layout with one electrode on each side
 
 

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from handtouch.field.mesh_surface import MeshSurface
     from handtouch.field.outline import Outline
     from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
-    from handtouch.field.residual import PointTest, point_test
     from handtouch.field.surface import (
         AnisotropicSurface,
         ConeSurface,
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
     from handtouch.field.two_layers import TwoLayers
 
 _LATER = {
-    **dict.fromkeys(("PointTest", "point_test"), "residual"),
     **dict.fromkeys(("BoundaryElectrode", "OutlineNetwork"), "outline_network"),
     **dict.fromkeys(("PlaneSurface", "CylinderSurface", "ConeSurface", "SphereSurface"), "surface"),
     **dict.fromkeys(("Film", "UnevenNetwork"), "film"),
@@ -75,7 +73,6 @@ __all__ = [
     "OutlineNetwork",
     "PlaneSurface",
     "PointEstimate",
-    "PointTest",
     "PressTable",
     "PrismSurface",
     "Rectangle",
@@ -91,7 +88,6 @@ __all__ = [
     "contact_stack_resistance",
     "estimate",
     "parse_stl",
-    "point_test",
     "unit_signal",
 ]
 
