@@ -44,6 +44,7 @@ from benchmarks.hand_touches import REST_S, SAMPLE_S, STEP_S, TOUCH_S, TouchRead
 from benchmarks.learned_ways import LEARNERS, Presses, learned
 from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, Rows, options, progress
+from benchmarks.paper_methods import LogRatioTable, single_sum_fractions
 from benchmarks.scores import laplace_covariance
 from benchmarks.touched_pads import PipelineCase, Touches, in_turns_of
 from handtouch import config, wire
@@ -53,7 +54,7 @@ from handtouch.core.pad_model import PadModel, contact_law, law_of
 from handtouch.core.stages import solve
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import ElectrodeNetwork, Rectangle
-from handtouch.field.paper_methods import LogRatioTable, log_ratio, single_sum_fractions
+from handtouch.field.figures import log_ratio
 from handtouch.hand import electrode_network
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch

@@ -1,10 +1,11 @@
 """Theoretical figures 2 to 7 of the paper, computed by `handtouch.field`, with its errata marked in red.
 
-Public names: `draw_figures`. Needs matplotlib, the extra `figures`.
+Public names: `draw_figures`, `log_ratio` (eq. 8). Needs matplotlib, the extra `figures`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,6 @@ from handtouch.field import (
     Rectangle,
     contact_stack_resistance,
 )
-from handtouch.field.paper_methods import log_ratio
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,6 +34,19 @@ SHEET_OHM = 2400.0  # the paper's conducting polymer, ohm per square
 SQUARE_M, GAP_M = 0.125, 0.007  # side of the large square; bare length at its corners
 PLUG_OHM = 200.0  # contact resistance under the banana plug, as assumed by the paper
 RESISTOR_OHM = 336.0
+
+
+def log_ratio(pad: Rectangle, currents: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return x_obs, y_obs of eq. 8, shape (...), from currents (4, ...) of x0, xa, y0, yb.
+
+    x_obs = a/2 + b/(2 pi) ln(I_xa / I_x0). On a square it is off by 0.12 of the side rms and 0.53 at worst,
+    5 % from the edges. NaN where a current is negative, infinite where one is zero.
+    """
+    currents = np.asarray(currents, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        x = pad.a / 2 + pad.b / (2 * math.pi) * np.log(currents[1] / currents[0])
+        y = pad.b / 2 + pad.a / (2 * math.pi) * np.log(currents[3] / currents[2])
+    return x, y
 
 
 def draw_figures(out_dir: Path, on_progress: Callable[[str], None] = lambda _: None) -> list[Path]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.paper_methods import LogRatioTable, single_sum_fractions
 from handtouch.field import Rectangle
+from handtouch.field.figures import log_ratio
 from handtouch.field.model import FloatArray
-from handtouch.field.paper_methods import (
-    LogRatioTable,
-    log_ratio,
-    single_sum_fractions,
-)
 
 SQUARE = Rectangle(1.0, 1.0)
 

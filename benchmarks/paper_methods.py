@@ -1,8 +1,8 @@
-"""The paper's own methods by name: its sums for the currents, its log ratio for the location.
+"""The paper's own methods by name: its sums for the currents, its table for the location.
 
-Public names: `single_sum_fractions` (eqs. 4-5), `log_ratio` (eq. 8), and `LogRatioTable`, which is eq. 8
-adjusted as in fig. 3 with the look-up table that the paper suggests.
-`Rectangle` computes the same exactly and faster; these serve figures and comparison.
+Public names: `single_sum_fractions` (eqs. 4-5) and `LogRatioTable`, which is eq. 8 (`log_ratio` of
+`handtouch.field.figures`) adjusted as in fig. 3 with the look-up table that the paper suggests. `Rectangle`
+computes the same exactly and faster.
 """
 
 from __future__ import annotations
@@ -33,19 +33,6 @@ def single_sum_fractions(pad: Rectangle, x: ArrayLike, y: ArrayLike, terms: int 
         along_x = _single_sum(a, b, x, y, terms), _single_sum(a, b, a - x, y, terms)
         along_y = _single_sum(b, a, y, x, terms), _single_sum(b, a, b - y, x, terms)
         return np.stack([*along_x, *along_y]).reshape(4, *on.shape)
-
-
-def log_ratio(pad: Rectangle, currents: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return x_obs, y_obs of eq. 8, shape (...), from currents (4, ...) of x0, xa, y0, yb.
-
-    x_obs = a/2 + b/(2 pi) ln(I_xa / I_x0). On a square it is off by 0.12 of the side rms and 0.53 at worst,
-    5 % from the edges. NaN where a current is negative, infinite where one is zero.
-    """
-    currents = np.asarray(currents, dtype=np.float64)
-    with np.errstate(all="ignore"):
-        x = pad.a / 2 + pad.b / (2 * math.pi) * np.log(currents[1] / currents[0])
-        y = pad.b / 2 + pad.a / (2 * math.pi) * np.log(currents[3] / currents[2])
-    return x, y
 
 
 class LogRatioTable:
