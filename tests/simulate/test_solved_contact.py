@@ -131,6 +131,23 @@ def test_contacts_are_those_of_finite_volumes(
         np.testing.assert_allclose(found_mm, centre_mm, atol=tolerance_mm)
 
 
+def test_currents_of_long_patches_beside_edges_rise_with_the_force(
+    plane: tuple[SimulatedSurface, SheetMapBank],
+) -> None:
+    rng = np.random.default_rng(2)
+    sides_mm, forces_n = np.array([LENGTH_MM, WIDTH_MM]), (1.0, 3.0, 10.0, 30.0)
+    for _ in range(400):
+        profile = PROFILES[rng.integers(len(PROFILES))]
+        direction = float(rng.uniform(0, np.pi))
+        patch = ContactPatch(1e-3 * rng.uniform(1.0, 4.0), rng.uniform(2.0, 3.0), direction, profile)
+        place_mm = sides_mm * rng.uniform(0.02, 0.98, 2)
+        axis = rng.integers(2)
+        place_mm[axis] = sides_mm[axis] * rng.choice([0.02, 0.05, 0.1])
+        totals = [solve_reduced(plane, patch, tuple(place_mm), force_n)[0] for force_n in forces_n]
+        assert min(currents.min() for currents in totals) > 0
+        assert (np.diff([currents.sum() for currents in totals]) > 0).all()
+
+
 @pytest.mark.parametrize("shape", [{"elongation": 3.0}, {"profile": "tilted", "direction_deg": 40.0}])
 def test_live_samples_and_series_have_the_same_counts_of_shaped_touches(
     deployment: config.Deployment, shape: dict[str, object]

@@ -274,7 +274,8 @@ def solve_patches(
     for column, value in zip(columns, (sheet_ohm, *layer, np.maximum(force_n, _MIN_FORCE_N)), strict=True):
         column[:] = value
     green, system, current = np.empty((k, NODES, NODES)), np.empty((NODES, NODES)), np.empty((n, NODES))
-    systems = NodeSystems(NODES, *map(_flat, (nodes.area_m2, nodes.pressure, green, system)))
+    scratch = system, np.empty(NODES)
+    systems = NodeSystems(NODES, *map(_flat, (nodes.area_m2, nodes.pressure, green, *scratch)))
     radius_m = np.exp(log_radius) * nodes.radius_ratio
     systems.fill_green(*map(_flat, (nodes.place_m, nodes.own_m, radius_m)))
     systems.solve(*map(_flat, (number, columns[4], columns[0], columns[1:4], current)))

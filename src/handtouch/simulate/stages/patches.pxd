@@ -1,7 +1,7 @@
 cimport cython
 from libc cimport math
 
-cdef double _4_PI
+cdef double _4_PI, _MAX_OWN
 
 cdef class NodeTables:
     cdef double[::1] table, breaks, values, slopes, work
@@ -19,9 +19,10 @@ cdef double _sum(NodeTables tables, Py_ssize_t first, Py_ssize_t along, Py_ssize
 
 cdef class NodeSystems:
     cdef Py_ssize_t nodes
-    cdef double[::1] area_m2, pressure, green, system
-    @cython.locals(green='double[::1]', nodes=Py_ssize_t, patch=Py_ssize_t, first=Py_ssize_t, i=Py_ssize_t,
-                   j=Py_ssize_t, at=Py_ssize_t, radius=double, x=double, y=double, dx=double, dy=double, ratio=double)
+    cdef double[::1] area_m2, pressure, green, system, nearest2
+    @cython.locals(green='double[::1]', nearest2='double[::1]', nodes=Py_ssize_t, patch=Py_ssize_t, first=Py_ssize_t,
+                   i=Py_ssize_t, j=Py_ssize_t, at=Py_ssize_t, radius=double, x=double, y=double, dx=double, dy=double,
+                   square=double, ratio=double)
     cpdef fill_green(self, double[::1] place_m, double[::1] own_m, double[::1] radius_m)
     @cython.locals(count=Py_ssize_t, nodes=Py_ssize_t, k=Py_ssize_t, first=Py_ssize_t, at=Py_ssize_t, i=Py_ssize_t,
                    j=Py_ssize_t, row=Py_ssize_t, log_force=double, log_ratio=double, specific=double)
