@@ -25,7 +25,7 @@ from benchmarks.hand_touches import TouchReadings, draw_touches, estimates
 from benchmarks.page import Report, Row, options, progress
 from benchmarks.scores import Estimates, EstimateScore, Share, bin_labels, concatenate, slices
 from handtouch import wire
-from handtouch.config import Deployment, load, shipped
+from handtouch.config import load, shipped
 from handtouch.config.shear import Shear
 from handtouch.core.pad_model import PadModel
 from handtouch.field.elastic_layer import calibrate_layer
@@ -194,15 +194,6 @@ def world_rows(touches: int) -> tuple[list[Row], list[Row]]:
     return rows, by_force
 
 
-def stated_deployment(drawn: DrawnWorld) -> Deployment:
-    """Return fingers above shear pads as their builder describes them, with the spread of mounts."""
-    mounts = drawn.world.mounts
-    stated = {"mount_std_mm": mounts.position_mm.std, "mount_std_deg": mounts.orientation_deg.std}
-    deployment = drawn.describe(load(shipped.path("shear.toml")))
-    hands = tuple(hand.model_copy(update=stated) for hand in deployment.hands)
-    return deployment.model_copy(update={"hands": hands})
-
-
 def tangential_error(
     contact: wire.Contact | None, truth: GroundTruth, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -218,7 +209,7 @@ def tangential_error(
 def served_forces(world: str, number: int, touches: int) -> Estimates:
     """Return errors of tangential forces of a drawn finger's touches, through the daemon's pipeline."""
     drawn = WORLDS[world].draw(Family.REPORTING.seed(number))
-    deployment = stated_deployment(drawn)
+    deployment = drawn.describe(load(shipped.path("shear.toml")))
     model, rng = PadModel(deployment), np.random.default_rng((drawn.seed, 7))
     pulled = []
     for touch in draw_touches(model.links, WARM_UP + touches, drawn.seed):

@@ -282,7 +282,7 @@ class DrawnWorld:
 
     def describe(self, deployment: config.Deployment) -> config.Deployment:
         """Return the deployment as its builder writes it: with the nominal behaviour of the drawn kinds, and
-        with the tolerances of his parts."""
+        with the tolerances of his parts and mounts."""
         parts, law = self.world.parts, self.world.sheets
         contacts, careful = self.world.contacts, len(self.world.contacts.profile.names) > 1
         of_node = {
@@ -308,7 +308,10 @@ class DrawnWorld:
             sheets[name] = sheet.model_copy(update=of_sheet | behaviour)
         nodes = {name: node.model_copy(update=of_node) for name, node in deployment.nodes.items()}
         shears = {name: self.world.shear.describe(shear) for name, shear in deployment.shears.items()}
-        update = {"sheets": sheets, "nodes": nodes, "shears": shears}
+        mounts = self.world.mounts
+        of_hand = {"mount_std_mm": mounts.position_mm.std, "mount_std_deg": mounts.orientation_deg.std}
+        hands = tuple(hand.model_copy(update=of_hand) for hand in deployment.hands)
+        update = {"sheets": sheets, "nodes": nodes, "shears": shears, "hands": hands}
         of_films = of_sheet | {"lead_std_ohm": of_node["series_std_ohm"]}
         return self.world.responses.describe(deployment.model_copy(update=update), of_films)
 
