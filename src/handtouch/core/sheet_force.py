@@ -32,7 +32,7 @@ IntArray = npt.NDArray[np.intp]
 _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
-_MAX_FORCE_STD_FRACTION = 1.0  # deviation over the force: above it, the force is invalid
+_MAX_FORCE_STD_FRACTION = 1.0  # deviation over the force: above it, the force is unreliable
 _GAIN_STD, _UNKNOWN_GAIN_STD = 0.04, 0.15
 """Relative errors of measured sheets, contact_ohm_std / alpha, and of one that wasn't: its loops, too."""
 _HOUR_S = 3600.0
@@ -90,9 +90,8 @@ _MIN_REFERENCE_INTERVAL_S = 1.0  # references in quicker succession aren't indep
 class ForceReliability(IntEnum):
     """Reliability of a pad's force."""
 
-    UNRELIABLE = 0  # too little evidence since the calibration, or baseline unknown
+    UNRELIABLE = 0  # too little evidence since the calibration, baseline unknown, or the force within its std
     RELIABLE = 1
-    INVALID = 2  # the sheet's state determines no force any more
 
 
 class ForceReference(NamedTuple):
@@ -401,7 +400,7 @@ class SheetForceCompensation:
         enough = (self.contacts[pressed] >= _MIN_CONTACTS) & (self.touched_s[pressed] >= _MIN_TOUCHED_S)
         known = enough | self._confirmed[pressed]
         sane = std < _MAX_FORCE_STD_FRACTION * force  # False for what isn't finite
-        self.state[pressed] = np.where(sane, known, ForceReliability.INVALID)
+        self.state[pressed] = sane & known
 
 
 class _BehaviourGroup:

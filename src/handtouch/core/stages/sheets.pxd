@@ -4,7 +4,6 @@ from handtouch.core.stages cimport loads
 from handtouch.core.stages.loads cimport SheetInterval, SheetLoads
 from handtouch.core.stages.rows cimport SheetLoadRow, ValueRow
 
-cdef Py_ssize_t _INVALID
 cdef double _BOUNDED, _BOUND_SIGMA, _NAN, _INFINITY
 cdef long long _MAX_PAUSE_NS
 
@@ -14,7 +13,7 @@ cdef class SheetStage:
     cdef Py_ssize_t sheets
     cdef long long period_ns, periods
     cdef double update_period_s
-    cdef unsigned char[::1] touching, reliability, new_contact
+    cdef unsigned char[::1] touching, new_contact
     cdef double[::1] max_force_n, gain, apparent_n, law_std_n, flow_s, impulse_ns
     cdef double[::1] back_waited_s, force_n, std_n, relative_std, waited_s
     cdef ValueRow[:] values

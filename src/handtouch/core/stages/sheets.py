@@ -26,7 +26,6 @@ UPDATE_PERIOD_S = 0.1
 SHEET_LOAD_ROW = np.dtype([("load", "<f8"), ("before", "<f8"), ("effective", "<f8"), ("reading", "<f8")])
 """Load of a sheet in a tick, that before hysteresis, the effective one, and the reading [N]"""
 _BOUNDED, _BOUND_SIGMA = float(BOUNDED), contact_law.BOUND_SIGMA
-_INVALID = 2  # ForceReliability
 _NAN, _INFINITY = float("nan"), float("inf")
 _MAX_PAUSE_NS = 3600 * 1_000_000_000
 
@@ -73,7 +72,7 @@ class SheetStage:
         self.flow_s, self.impulse_ns = arrays["flow_s"], arrays["impulse_ns"]
         self.back_waited_s = arrays["back_waited_s"]
         self.force_n, self.std_n = arrays["compensated_force_n"], arrays["compensated_std_n"]
-        self.relative_std, self.reliability = arrays["relative_std"], arrays["force_reliability"]
+        self.relative_std = arrays["relative_std"]
         self.last_touch_ns, self.new_contact = arrays["last_touch_ns"], arrays["new_contact"]
         self.updated_ns, self.waited_s = arrays["sheets_updated_ns"], arrays["uncertainty_waited_s"]
         self.update_period_s = UPDATE_PERIOD_S
@@ -127,7 +126,7 @@ class SheetStage:
                 force *= math.exp(-_BOUND_SIGMA * relative)
             if force > self.max_force_n[row]:
                 force = self.max_force_n[row]
-            self.values[pad].force_n = _NAN if self.reliability[pad] == _INVALID and not bounded else force
+            self.values[pad].force_n = force if relative < _INFINITY else _NAN
             self.values[pad].force_std_n = _INFINITY if bounded else self.std_n[pad]
 
 

@@ -5,7 +5,7 @@ from handtouch.core.stages.receive cimport SampleMemory
 from handtouch.core.stages.rows cimport RadiusRow, SheetRow, ValueRow
 
 cdef Py_ssize_t _ROWS, _BETWEEN
-cdef Py_ssize_t _FITTED, _WIDE, _MAX_STEPS, _INVALID, _WIDE_NODES
+cdef Py_ssize_t _FITTED, _WIDE, _MAX_STEPS, _WIDE_NODES
 cdef long long _MAX_EQUAL_SAMPLES
 cdef double _BOUND_SIGMA, _MAX_CURRENT_FRACTION, _MIN_LEFT, _THIRD, _NAN, _INFINITY, _MAX_STEP, _CONVERGED_SIGMA
 cdef double _NODE_SIGMA, _MAX_NEAR_STD, _MAX_SQUARED_CONTRADICTION, _MAX_SPREAD, _MIN_VARIANCE
@@ -19,7 +19,7 @@ cdef class TwoSheets:
     cdef double[::1] offset_std, block_sum, block_squares, block_count, second_force_n, second_std_n
     cdef SheetRow[::1] sheets
     cdef RadiusRow[::1] rows
-    cdef unsigned char[::1] usable, touching, reliability, new_contact, known, second_touching
+    cdef unsigned char[::1] usable, touching, new_contact, known, second_touching
     cdef loads.SheetLoads first, second
     cdef force.StackTable stack
     cdef force.ForceResult result

@@ -82,7 +82,6 @@ contradict each other"""
 _MEAN_UNEVEN = 0.3
 """Mean of what an uneven pressure adds to the logarithm of a layer's conductance, in deviations of it: even,
 Hertz's, tilted, annular and two-spot pressures, weighted alike, beside even discs of the same area"""
-_INVALID = 2  # ForceReliability
 _MAX_SPREAD = 4.0  # mean times mean inverse of a force from which on it is WIDE, see `force`
 _MIN_VARIANCE, _MIN_RADIUS_VARIANCE = 1e-12, 1e-8
 _MAX_LOG_FORCE = 60.0
@@ -124,7 +123,7 @@ class TwoSheets:
         self.first, self.second = first, second
         self.touching, self.rising = state["touching"], state["contradicting_samples"]
         self.last_counts, self.equal_samples = state["second_count"], state["equal_samples"]
-        self.gain, self.reliability = state["log_gain"], state["force_reliability"]
+        self.gain = state["log_gain"]
         self.force_n, self.std_n = state["joint_force_n"], state["joint_std_n"]
         self.new_contact, self.relative_std = state["new_contact"], state["relative_std"]
         self.known, self.offset_std = second_state["known"], second_state["offset_std"]
@@ -487,7 +486,7 @@ def store_both(both: TwoSheets, values: RowArray) -> None:
     """Replace the forces of touched pads in their VALUE_ROWs by those of both sheets."""
     for k in range(both.count):
         pad = both.pads[k]
-        if not both.touching[pad] or not both.force_n[k] > 0.0 or both.reliability[pad] == _INVALID:
+        if not both.touching[pad] or not both.force_n[k] > 0.0:
             continue
         gain = math.exp(both.gain[pad])
         force_n, std_n = gain * both.force_n[k], gain * both.std_n[k]
