@@ -32,8 +32,8 @@ class Table(BaseModel):
 class OneOfKinds:
     """Marks a table that follows one of several models by its key `kind`.
 
-    Errors and schema are those of a union with that discriminator, but only the models of the kinds that a
-    file names are asked of `kinds`.
+    Errors and schema are those of a union with that discriminator, but only models of kinds that a file names
+    are asked of `kinds`.
     """
 
     def __init__(self, kinds: Mapping[str, type[Table]]) -> None:
@@ -47,14 +47,12 @@ class OneOfKinds:
         return handler(core_schema.tagged_union_schema(models, "kind"))
 
     def _validate(self, value: object) -> Table:
-        if isinstance(value, Table):
-            return value
-        if not isinstance(value, dict):
+        if not isinstance(value, dict | Table):
             raise PydanticKnownError("model_attributes_type")
+        kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
         context: dict[str, Any] = {"discriminator": "'kind'"}
-        if "kind" not in value:
+        if kind is None:
             raise PydanticKnownError("union_tag_not_found", context)
-        kind = value["kind"]
         if not isinstance(kind, str) or kind not in self._kinds:
             context |= {"tag": str(kind), "expected_tags": ", ".join(map(repr, self._kinds))}
             raise PydanticKnownError("union_tag_invalid", context)

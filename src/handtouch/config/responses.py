@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -22,6 +22,7 @@ from handtouch.config.base import (
     PER_CHANNEL,
     Name,
     NonNegative,
+    OneOfKinds,
     Positive,
     PositivePerChannel,
     Table,
@@ -370,11 +371,7 @@ RESPONSES: dict[str, type[ResponseTable]] = {
 }
 """Tables of responses by their kind."""
 
-if TYPE_CHECKING:
-    PadResponse = ResponseTable
-else:
-    PadResponse = Annotated[Union[tuple(RESPONSES.values())], Field(discriminator="kind")]  # noqa: UP007
-
+PadResponse = Annotated[ResponseTable, OneOfKinds(RESPONSES)]
 _ADAPTER: TypeAdapter[ResponseTable] = TypeAdapter(PadResponse)
 
 

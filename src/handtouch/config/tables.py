@@ -859,8 +859,8 @@ TABLES: dict[str, type[Table]] = {
 }
 KINDS: dict[str, Mapping[str, type[Table]]] = {
     "surface": SURFACE_TABLES,
-    "response": {**RESPONSES},
-    "pattern": {**SHEAR_PATTERNS},
+    "response": RESPONSES,
+    "pattern": SHEAR_PATTERNS,
     "shape": OBJECT_SHAPES,
 }
 """Models by the key `kind`, of each table that follows one of several."""

@@ -12,12 +12,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, Union
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS, Name, Positive, Table
+from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS, Name, OneOfKinds, Positive, Table
 from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
 from handtouch.config.tables import NodeId
 from handtouch.config.toml_text import parse_toml, read_text
@@ -31,10 +31,7 @@ PadChannels = Annotated[
 ]
 KINDS: Mapping[str, Tables] = {"source": source_kinds()}
 """Models of tables that follow one of several, by `kind`"""
-if TYPE_CHECKING:
-    AnySource = Source
-else:
-    AnySource = Annotated[Union[tuple(KINDS["source"].values())], Field(discriminator="kind")]  # noqa: UP007
+AnySource = Annotated[Source, OneOfKinds(KINDS["source"])]
 PerChannel = Annotated[tuple[float, ...], Field(strict=False)]
 Serial = Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
 _Model = TypeVar("_Model", bound=Table)

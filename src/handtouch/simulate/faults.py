@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, Union
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from handtouch.config.base import Name, NonNegative, Positive, Table
+from handtouch.config.base import Name, NonNegative, OneOfKinds, Positive, Table
 from handtouch.config.tables import SIDE_ELECTRODES, Electrode
 from handtouch.simulate import draws
 from handtouch.simulate.sheet_circuit import Wiring
@@ -398,11 +398,7 @@ FAULTS: Mapping[str, type[Fault]] = MappingProxyType(
 INFLUENCES: Mapping[str, type[Fault]] = MappingProxyType(
     {it.fault_kind(): it for it in _ALL if it.is_influence}
 )
-
-if TYPE_CHECKING:
-    AnyFault = Fault
-else:
-    AnyFault = Annotated[Union[_ALL], Field(discriminator="kind")]  # noqa: UP007  of a tuple
+AnyFault = Annotated[Fault, OneOfKinds({**FAULTS, **INFLUENCES})]
 
 
 def electrode_index(electrode: str) -> int:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
+from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from handtouch.config.base import Name, NonNegative, Positive, Table
+from handtouch.config.base import Name, NonNegative, OneOfKinds, Positive, Table
 from handtouch.config.channels import parse_object
 from handtouch.config.eds import EdsError
 from handtouch.config.tables import Unsigned32
@@ -133,13 +133,8 @@ class ChangedSetting(NodeFault):
         """Leave the object as it is."""
 
 
-_ALL = tuple(NodeFault.__subclasses__())
 NODE_FAULTS: Mapping[str, type[NodeFault]] = MappingProxyType(
-    {it.model_fields["kind"].default: it for it in _ALL}
+    {it.model_fields["kind"].default: it for it in NodeFault.__subclasses__()}
 )
 """By kind, as in a scenario file."""
-
-if TYPE_CHECKING:
-    AnyNodeFault = NodeFault
-else:
-    AnyNodeFault = Annotated[Union[_ALL], Field(discriminator="kind")]  # noqa: UP007  of a tuple
+AnyNodeFault = Annotated[NodeFault, OneOfKinds(NODE_FAULTS)]
