@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.core.memory import RowArray, view_memory, view_rows
+from handtouch.core.memory import RowArray, made_once, view_memory, view_rows
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.solve import (
@@ -83,7 +83,7 @@ def make_solver(
         models=model.stage_tables(),
         pad_tolerances=model.stage_tolerances(),
         laws=model.stage_laws(),
-        surfaces=[PadSurface(surface) for surface in model.surface_tables],
+        surfaces=made_once(PadSurface, zip(model.surface_tables, strict=True)),
         known=PartKnowledge(model.part_axes, model.part_axis_ends, model.part_offsets, model.touch_errors),
         arrays={name: _view(name, array) for name, array in arrays.items()},
         both=both,

@@ -2,19 +2,20 @@
 of named numbers.
 
 Public names: `view_memory`, `number_memory`, `view_rows`, `rows_at`, `rows_by_name`, `number_row`,
-`slices_of`, `row_count`, `RowArray`.
+`slices_of`, `row_count`, `made_once`, `RowArray`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from types import NoneType
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+_Made = TypeVar("_Made")
 RowArray = np.recarray[tuple[int], np.dtype[np.void]]
 _NUMBERS = {float, int, bool, NoneType}
 _SIZE = 8
@@ -79,3 +80,17 @@ def slices_of(row: np.dtype[np.void]) -> dict[str, slice]:
 def row_count(row: np.dtype[Any]) -> int:
     """Return the number of numbers in a row."""
     return row.itemsize // _SIZE
+
+
+def made_once(make: Callable[..., _Made], rows: Iterable[tuple[Any, ...]]) -> list[_Made]:
+    """Return what `make` returns for each row of arguments; rows of the same objects share one result.
+
+    Copies of a hand in many environments then share tables, which otherwise don't fit into a processor's
+    caches.
+    """
+    rows = list(rows)
+    made: dict[tuple[int, ...], _Made] = {}
+    for row in rows:
+        if (key := tuple(map(id, row))) not in made:
+            made[key] = make(*row)
+    return [made[tuple(map(id, row))] for row in rows]

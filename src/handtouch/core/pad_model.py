@@ -20,7 +20,7 @@ from handtouch.config.channels import (
 from handtouch.config.roles import CHANNEL_ROLES, SECOND_SHEET, SHEAR, channel_numbers
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.channel_currents import ChannelCurrents
-from handtouch.core.memory import RowArray, number_row, rows_at, rows_by_name, view_memory
+from handtouch.core.memory import RowArray, made_once, number_row, rows_at, rows_by_name, view_memory
 from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
 from handtouch.core.shear_pads import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
@@ -112,13 +112,10 @@ class PadModel:
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.mounts = np.concatenate([_mounts_of(hand) for hand in deployment.hands])
-        self.surface_tables = [
-            SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad)) for pad in pads
-        ]
+        self.surface_tables = made_once(_surface_patches, zip(pads, strict=True))
         self._set_channels(deployment)
         self.networks = networks = networks_of(deployment)
-        tables = {key: forward_table(network) for key, network in {id(n): n for n in networks}.items()}
-        self.forward_tables = [tables[id(network)] for network in networks]
+        self.forward_tables = made_once(forward_table, zip(networks, strict=True))
         self._whole_tables = list(self.forward_tables)
         self.default_calibration_ids = [default_calibration_id_of(pad, deployment) for pad in pads]
         self.calibrations = [self.default_calibration(pad) for pad in range(self.size)]
@@ -391,13 +388,15 @@ class PadModel:
 
     def stage_tolerances(self) -> list[PadTolerances]:
         """Return the tolerances of the pads' parts as the stages take them."""
-        columns = zip(self._parts, self.networks, self.forward_tables, strict=True)
-        return [PadTolerances(*parts, network, table) for parts, network, table in columns]
+        columns = zip(*zip(*self._parts, strict=True), self.networks, self.forward_tables, strict=True)
+        return made_once(PadTolerances, columns)
 
     def stage_tables(self) -> list[ModelTable]:
         """Return the forward models as the stages take them."""
-        pads = zip(self.forward_tables, self.state_counts.tolist(), self.networks, strict=True)
-        return [ModelTable(table, states, network.is_potential) for table, states, network in pads]
+        potential = [network.is_potential for network in self.networks]
+        return made_once(
+            ModelTable, zip(self.forward_tables, self.state_counts.tolist(), potential, strict=True)
+        )
 
     def pair_settings(self) -> FloatArray:
         """Return the limit (n,) of one contact's squared misfit beyond which two are tried, and the deviation
@@ -581,6 +580,10 @@ def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
     """Return the rows of each hand; the pads of a hand are consecutive."""
     first = {hand: hands.index(hand) for hand in hands}
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
+
+
+def _surface_patches(pad: config.Pad) -> SurfacePatches:
+    return SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad))
 
 
 def networks_of(deployment: Deployment) -> list[ChannelModel]:

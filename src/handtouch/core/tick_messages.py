@@ -84,11 +84,12 @@ class TickMessages:
             else result.updated,
             "end": result.ended,
         }
+        subscribed, topics = sink.has_subscriber, self._topics
         for event, rows in events.items():
             if len(rows):
                 self._state.contact_seq[rows] += 1
             for pad in rows.tolist():
-                if sink.has_subscriber(self._topics[pad]):
+                if subscribed(topics[pad]):
                     sink.send(self._contact_message(pad, event, result.sync_ns, now_ns))
         if len(result.ended):
             self._tick.clear_ended(result.ended)
@@ -113,10 +114,11 @@ class TickMessages:
         held = self._state
         held.frame_seq[0] += 1
         held.frame_tick[0], held.frame_sync_ns[0] = tick_number, sync_ns
+        subscribed = sink.has_subscriber
         for hand, topic, raw in self._hand_topics:
-            if sink.has_subscriber(topic):
+            if subscribed(topic):
                 sink.send(self._hand_frame(hand))
-            if sink.has_subscriber(raw):
+            if subscribed(raw):
                 sink.send(self._raw_message(hand, slab))
 
     def retained_messages(self) -> dict[str, Callable[[int], wire.OutgoingMessage | None]]:
@@ -154,6 +156,11 @@ class TickMessages:
         """
         rows, layout = slice(0, self._model.size), wire.COLUMNS[wire.HandFrame]
         return {name: array.astype(layout[name].dtype) for name, array in self._frame_sources(rows).items()}
+
+    def copy_frame_columns(self, into: Mapping[str, NDArray[Any]]) -> None:
+        """Copy `frame_columns` into arrays of these shapes and types."""
+        for name, array in self._frame_sources(slice(0, self._model.size)).items():
+            into[name][:] = array
 
     def _make_contact_encoder(self, model: PadModel) -> ContactEncoder:
         tick = self._tick

@@ -43,7 +43,10 @@ class ChannelErrors:
         self._bend = np.array([one.nonlinearity_counts for one in hidden])
         self._hum = np.array([one.hum_counts for one in hidden])
         self._common = np.array([one.common_noise_counts for one in hidden])
-        self._channels, self._columns = np.array(channels), np.arange(count)
+        first = count * np.arange(len(pads))[:, None]
+        columns = np.arange(count)
+        before = np.where(columns > 0, columns - 1, np.array(channels)[:, None] - 1)
+        self._before = (first + before).ravel()  # of all channels, row by row: that which is converted before
         self._per_count = 2 * np.pi * _BENDS / np.array(top_counts)[:, None]
         self._keys = np.array([noise.stream_key(world.seed, "common", *name) for name in names])
         self._phase = 2 * np.pi * (self._keys.astype(np.float64) % 4093) / 4093
@@ -60,8 +63,9 @@ class ChannelErrors:
 
     def distorted(self, counts: FloatArray) -> FloatArray:
         """Return what channels read (..., rows, c) for these counts, before rounding."""
-        before = np.where(self._columns > 0, self._columns - 1, self._channels[:, None] - 1)
-        mixed = counts + self._crosstalk[:, None] * np.take_along_axis(
-            counts, np.broadcast_to(before, counts.shape), axis=-1
-        )
-        return np.asarray(mixed + self._bend * np.sin(mixed * self._per_count))
+        before = counts.reshape(*counts.shape[:-2], -1).take(self._before, axis=-1).reshape(counts.shape)
+        mixed = counts + self._crosstalk[:, None] * before
+        bend = np.sin(mixed * self._per_count)
+        bend *= self._bend
+        mixed += bend
+        return np.asarray(mixed)

@@ -83,14 +83,21 @@ def _wave_ends_at(keys: bytes, numbers: tuple[int, ...]) -> FloatArray:
 def _uniform(keys: ArrayLike, counters: ArrayLike) -> FloatArray:
     """Return uniform numbers in the open interval from 0 to 1."""
     with np.errstate(over="ignore"):
-        mixed = _mix_bits(np.asarray(keys, np.uint64) + np.uint64(0x9E3779B97F4A7C15))
-        mixed = _mix_bits(
-            mixed ^ (np.asarray(counters, np.int64).astype(np.uint64) * np.uint64(0xD1B54A32D192ED03))
-        )
-    return np.asarray(((mixed >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53)
+        mixed = _mix_bits(np.asarray(np.asarray(keys, np.uint64) + np.uint64(0x9E3779B97F4A7C15)))
+        of_counters = np.asarray(counters, np.int64).astype(np.uint64) * np.uint64(0xD1B54A32D192ED03)
+        mixed = _mix_bits(np.asarray(mixed ^ of_counters))
+    mixed >>= np.uint64(11)
+    uniform = np.asarray(mixed.astype(np.float64))
+    uniform += 0.5
+    uniform *= 2.0**-53
+    return uniform
 
 
 def _mix_bits(bits: KeyArray) -> KeyArray:
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(bits ^ (bits >> np.uint64(31)))
+    """Mix the bits of an array, in place."""
+    bits ^= bits >> np.uint64(30)
+    bits *= np.uint64(0xBF58476D1CE4E5B9)
+    bits ^= bits >> np.uint64(27)
+    bits *= np.uint64(0x94D049BB133111EB)
+    bits ^= bits >> np.uint64(31)
+    return bits

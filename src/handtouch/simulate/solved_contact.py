@@ -123,6 +123,8 @@ class PatchNodes(NamedTuple):
     def of_patches(cls, shape: SimulatedSurface, position: FloatArray, patch: FloatArray) -> PatchNodes:
         """Return the nodes of patches (PATCH_ROWS, k) whose pressures' centres, were they all on the pad, are
         at positions (2, k), fractions of the pad."""
+        if (patch[1:] == patch[1:, :1]).all():
+            return _nodes_of(shape, position, patch[0], _form(*patch[1:, 0].tolist(), shape.stretch))
         groups: dict[tuple[float, float, float], list[int]] = {}
         for k, form in enumerate(zip(*patch[1:].tolist(), strict=True)):
             groups.setdefault(form, []).append(k)
@@ -130,8 +132,6 @@ class PatchNodes(NamedTuple):
             _nodes_of(shape, position[:, at], patch[0, at], _form(*form, shape.stretch))
             for form, at in groups.items()
         ]
-        if len(parts) == 1:
-            return parts[0]
         return cls.joined(parts).taken(np.argsort(np.concatenate(list(groups.values()))))
 
     @classmethod

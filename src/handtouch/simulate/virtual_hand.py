@@ -166,7 +166,8 @@ class VirtualHand:
         """Return zeros and noise (hands, pads, c) [counts] at `t_s`, of hands that differ in noise only; the
         first one is that of `sample`."""
         keys = self._keys + (np.arange(hands, dtype=np.uint64) * _KEY_STEP)[:, None, None]
-        counts = self._noise[:, None] * noise.standard_normal(keys, round(t_s * 1e9))
+        counts = noise.standard_normal(keys, round(t_s * 1e9))
+        counts *= self._noise[:, None]
         if not self._drift.is_constant:
             counts += self._drift.zero_counts(np.array([t_s]))
         if self._errors.disturbs:
@@ -190,7 +191,8 @@ class VirtualHand:
         """Return readings (..., pads, c) of the converters."""
         if self._errors.distorts:
             counts = self._errors.distorted(counts)
-        return np.asarray(np.clip(np.rint(counts), self._low, self._high), dtype=np.int64)
+        counts = np.rint(counts)
+        return np.asarray(np.clip(counts, self._low, self._high, out=counts), dtype=np.int64)
 
     def counts(self, pad_row: int, times_s: ArrayLike) -> NDArray[np.int64]:
         """Return counts (n, m) of the m channels of one pad at times (n,), the same as those of `sample`."""

@@ -29,5 +29,6 @@ cdef class NodeSystems:
     cpdef solve(self, const Py_ssize_t[::1] patches, double[::1] force_n, double[::1] sheet_ohm, double[::1] layer,
                 double[::1] current)
 
-@cython.locals(top=Py_ssize_t, row=Py_ssize_t, p=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, ratio=double, total=double)
+@cython.locals(top=Py_ssize_t, under=Py_ssize_t, row=Py_ssize_t, p=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, ratio=double,
+               second=double, total=double)
 cdef void _solve_symmetric(double[::1] system, Py_ssize_t n, double[::1] right, Py_ssize_t first) noexcept

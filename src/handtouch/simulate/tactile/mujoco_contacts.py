@@ -5,6 +5,7 @@ Public names: `LinkPoints` (points on the links), `NO_POINTS`, `ContactReader` (
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -64,38 +65,40 @@ class ContactReader:
                 np.arange(model.ngeom) == geom if geom >= 0 else model.geom_bodyid == self._bodies[row]
             )
         self._curvature = np.array([_curvature(model, geom) for geom in range(model.ngeom)])
+        self._states: list[Any] = []
+        self._views: list[tuple[Any, FloatArray, FloatArray]] = []
+        """of the states read last: contacts, and rotations and positions of bodies; they follow each step"""
 
     def read(self, states: Sequence[Any]) -> LinkPoints:
         """Return the contacts of environments with the data `states`, after a step or mj_forward."""
-        touched = [number for number, data in enumerate(states) if data.ncon]
-        if not touched:
+        if len(states) != len(self._states) or not all(map(operator.is_, states, self._states)):
+            self._states = list(states)
+            self._views = [(data.contact, data.xmat, data.xpos) for data in states]
+        found = [(number, *views) for number, views in enumerate(self._views) if len(views[0])]
+        if not found:
             return NO_POINTS
-        found = [states[number] for number in touched]
-        contacts = [data.contact for data in found]
-        geoms = np.concatenate([each.geom for each in contacts]).reshape(-1, 2)
-        address = np.concatenate([each.efc_address for each in contacts])
-        counts = [data.ncon for data in found]
-        begins = np.cumsum([0, *counts])
-        owners = np.repeat(np.arange(len(found)), counts)
-        side, pad, contact = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2) & (address >= 0))
-        order = np.argsort(owners[contact], kind="stable")
+        owners, contacts, rotations, positions = zip(*found, strict=True)
+        counts = [len(each) for each in contacts]
+        geoms = np.concatenate([each.geom for each in contacts])
+        owner = np.repeat(np.arange(len(owners)), counts)
+        side, pad, contact = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2))
+        order = np.argsort(owner[contact], kind="stable")
         side, pad, contact = side[order], pad[order], contact[order]
-        owner, bodies, k = owners[contact], self._bodies[pad], len(pad)
-        forces = np.empty((k, 6))
-        for row, (data, index) in enumerate(
-            zip(owner.tolist(), (contact - begins[owner]).tolist(), strict=True)
-        ):
-            mujoco.mj_contactForce(self._model, found[data], index, forces[row])
-        frames = np.concatenate([each.frame for each in contacts]).reshape(-1, 3, 3)[contact]
+        owner, k = owner[contact], len(pad)
+        environment, index = np.array(owners)[owner], contact - (np.cumsum(counts) - counts)[owner]
+        forces, contact_force = np.empty((k, 6)), mujoco.mj_contactForce  # 0 of excluded contacts
+        for number, at, force in zip(environment.tolist(), index.tolist(), forces, strict=True):
+            contact_force(self._model, states[number], at, force)
+        frames = np.concatenate([each.frame for each in contacts])[contact].reshape(-1, 3, 3)
         # rows of a contact's frame: its normal, from the first geom to the second, and two tangents
         on_second = np.einsum("ki,kij->kj", forces[:, :3], frames)
         on_link = np.where(side[:, None] == 1, on_second, -on_second)
-        at = owner * self._model.nbody + bodies
-        rotation = np.concatenate([data.xmat for data in found])[at].reshape(k, 3, 3)
-        origin = np.concatenate([data.xpos for data in found])[at]
+        body = owner * self._model.nbody + self._bodies[pad]
+        rotation = np.concatenate(rotations)[body].reshape(k, 3, 3)
+        origin = np.concatenate(positions)[body]
         position = np.concatenate([each.pos for each in contacts])[contact]
         return LinkPoints(
-            np.array(touched)[owner],
+            environment,
             pad,
             np.einsum("kji,kj->ki", rotation, position - origin),
             np.einsum("kji,kj->ki", rotation, on_link),

@@ -75,6 +75,10 @@ class TactileSensor:
         ]
         self._cores = _pipelines(deployment, environments, self._period_ns)
         self._states = [core.save_state() for core in self._cores]
+        self._columns = {
+            name: (column.shape[1:], column.dtype)
+            for name, column in self._cores[0].messages.frame_columns().items()
+        }
         self._settling_samples = round(settling_s / self.period_s)
         self._samples = 0
         self._restarted: set[int] = set()
@@ -170,7 +174,8 @@ class TactileSensor:
     def _process(self, counts: NDArray[np.int64]) -> TactileReading:
         sync_ns = _START_NS + self._samples * self._period_ns
         pads = len(self.links)
-        parts = []
+        rows = self.environments * pads
+        columns = {name: np.empty((rows, *shape), dtype) for name, (shape, dtype) in self._columns.items()}
         for number, core in enumerate(self._cores):
             first = number * _HANDS_PER_PIPELINE
             present = counts[first : first + core.model.size // pads]
@@ -182,18 +187,17 @@ class TactileSensor:
             core.begin_cycle(sync_ns, sync_ns)
             core.slab.store_counts(present.reshape(-1, 4), sync_ns + 1)
             core.tick_if_due(sync_ns + core.cycle.window_ns)
-            parts.append(core.messages.frame_columns())
+            of_core = slice(first * pads, (first + len(present)) * pads)
+            core.messages.copy_frame_columns({name: column[of_core] for name, column in columns.items()})
         self._restarted.clear()
-        columns = {
-            name: np.concatenate([part[name] for part in parts]).reshape(
-                self.environments, pads, *parts[0][name].shape[1:]
-            )
-            for name in parts[0]
-        }
-        matrices = [name for name in columns if wire.COLUMNS[wire.HandFrame][name].elements == 9]
-        for name in matrices:
-            columns[name] = columns[name].reshape(self.environments, pads, 3, 3)
-        return TactileReading(counts=counts, **columns)
+        shape = self.environments, pads
+        return TactileReading(
+            counts=counts,
+            **{
+                name: column.reshape(*shape, *((3, 3) if column.shape[1:] == (9,) else column.shape[1:]))
+                for name, column in columns.items()
+            },
+        )
 
 
 def _sensor_in_state(arguments: tuple[Any, ...], state: tuple[Any, ...]) -> TactileSensor:
