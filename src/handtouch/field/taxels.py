@@ -31,6 +31,7 @@ _RING = math.sqrt(2 / 3)
 _RING_POINTS = 6
 """Mean over a disc by its centre, weight 1/4, and six points on a ring (Abramowitz and Stegun 25.4.61): exact
 for polynomials of degree 5."""
+_SHIFT_STEP = 0.05  # of differences by a taxel's place, in widths
 
 
 class TaxelContact(NamedTuple):
@@ -94,11 +95,7 @@ class TaxelArray(ChannelMap):
         else:
             given = np.asarray(normals, np.float64)
             self._normals = given / np.linalg.norm(given, axis=1, keepdims=True)
-        # a channel's own width moves its signal as a shift across does at that distance
-        self._position_std_m = np.hypot(tolerances.position_m, tolerances.width * self._width)
         self._tolerances = tolerances
-        norm = 0.25 + 0.75 * self._profile((_RING * patch.radius_m / self._width) ** 2)
-        self._per_unit = self._gain / norm
 
     @property
     def touch_error(self) -> float:
@@ -112,14 +109,15 @@ class TaxelArray(ChannelMap):
         along = np.array([1.0, 0.0, 0.0]) - self._normals[:, :1] * self._normals
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         across = np.cross(self._normals, along)
-        step = self._position_std_m[:, None]
-        return np.stack(
+        step = _SHIFT_STEP * self._width[:, None]
+        shape = (-1, *(1,) * np.ndim(x))
+        # a width changes a signal as a shift by the same share of the distance does
+        by_width = self._tolerances.width * np.sqrt(self._squares(x, y, self._places))
+        std = np.hypot(self._tolerances.position_m, by_width) / (2 * step.reshape(shape))
+        return std * np.stack(
             [
-                (
-                    self._respond(x, y, self._places + step * way, self._width)
-                    - self._respond(x, y, self._places - step * way, self._width)
-                )
-                / 2
+                self._respond(x, y, self._places + step * way, self._width)
+                - self._respond(x, y, self._places - step * way, self._width)
                 for way in (along, across)
             ]
         )
@@ -164,7 +162,8 @@ class TaxelArray(ChannelMap):
             ring_x = np.clip(x + reach * math.cos(angle) / scale_x, 0, self.a)
             ring_y = np.clip(y + reach * math.sin(angle) / scale_y, 0, self.b)
             found += 0.75 / _RING_POINTS * self._point_response(ring_x, ring_y, places, width, profile)
-        return found * self._per_unit.reshape(-1, *(1,) * x.ndim)
+        right_on_it = 0.25 + 0.75 * self._profile((reach / width) ** 2)
+        return found * (self._gain / right_on_it).reshape(-1, *(1,) * x.ndim)
 
     def _point_response(
         self,
@@ -174,16 +173,17 @@ class TaxelArray(ChannelMap):
         width: FloatArray,
         profile: Callable[[FloatArray], FloatArray],
     ) -> FloatArray:
-        point, outward = self.surface.point(x, y), self.surface.normal(x, y)
-        shape = (-1, *(1,) * np.ndim(x))
+        outward, shape = self.surface.normal(x, y), (-1, *(1,) * np.ndim(x))
+        facing = sum(outward[axis] * self._normals[:, axis].reshape(shape) for axis in range(3))
+        square = self._squares(x, y, places) / width.reshape(shape) ** 2
+        return np.asarray(profile(square) * np.maximum(facing, 0.0))
+
+    def _squares(self, x: FloatArray, y: FloatArray, places: FloatArray) -> FloatArray:
+        """Return the squared distances (n, ...) of places on the pad from the taxels' axes [m^2]."""
+        point, shape = self.surface.point(x, y), (-1, *(1,) * np.ndim(x))
         away = [point[axis] - places[:, axis].reshape(shape) for axis in range(3)]
-        normals = [self._normals[:, axis].reshape(shape) for axis in range(3)]
-        height = sum(one * normal for one, normal in zip(away, normals, strict=True))
-        square = sum(one * one for one in away) - height * height
-        facing = sum(outward[axis] * normals[axis] for axis in range(3))
-        return np.asarray(
-            profile(np.maximum(square, 0.0) / width.reshape(shape) ** 2) * np.maximum(facing, 0.0)
-        )
+        height = sum(one * self._normals[:, axis].reshape(shape) for axis, one in enumerate(away))
+        return np.maximum(sum(one * one for one in away) - height * height, 0.0)
 
 
 def _tail(square: FloatArray) -> FloatArray:
