@@ -14,8 +14,16 @@ from numpy.typing import NDArray
 
 from handtouch.sheet import S1, S2, Fluctuation, PrandtlIshlinskii, SheetModel
 from handtouch.simulate.preisach import HomogeneousLoops, Loops, PlayLoops
-from handtouch.simulate.sheet_physics import BackForces, ElementCreep, PowerCreep, SheetLaw, SheetStates
+from handtouch.simulate.sheet_physics import (
+    CALIBRATION_S,
+    BackForces,
+    ElementCreep,
+    PowerCreep,
+    SheetLaw,
+    SheetStates,
+)
 from handtouch.simulate.worlds import SHEET_KINDS
+from handtouch.simulate.worlds.sheet_kinds import ELASTOMER
 
 FloatArray = NDArray[np.float64]
 ONE = np.zeros(1, np.intp)
@@ -191,3 +199,10 @@ def test_varied_sheets_keep_the_structure_of_their_kind() -> None:
     steep = SHEET_KINDS["steep_creep"].varied(1.0, 1.0, 1.0, 1.0, 1.5, 1.0).creep
     assert isinstance(steep, PowerCreep)
     assert steep.exponent == pytest.approx(0.15)
+
+
+def test_a_cover_reads_the_weight_that_it_was_calibrated_by() -> None:
+    states = SheetStates(ELASTOMER.law)
+    assert 0.95 < states.advance(ONE, 0.01, 1.0) < 0.99  # it creeps
+    assert states.advance(ONE, CALIBRATION_S - 0.01, 1.0) == pytest.approx(1.0)
+    assert SheetStates(ELASTOMER.law).advance(ONE, CALIBRATION_S, 5.0) > 5.4  # at 1 N, plays hold a part back

@@ -90,6 +90,16 @@ def response_value(name: str) -> Draw:
     return lambda drawn, _: getattr(drawn.response("left/pad", 4), name)
 
 
+def film_unevenness(drawn: DrawnWorld, _: config.Deployment) -> Any:
+    films = two_layers()
+    return drawn.pad(films.name, films.pads[0]).unevenness
+
+
+@cache
+def two_layers() -> config.Hand:
+    return config.load(config.shipped.path("two_layers.toml")).hands[0]
+
+
 CHANNEL_ERRORS = ("common_noise_counts", "hum_counts", "crosstalk", "nonlinearity_counts")
 
 
@@ -135,6 +145,7 @@ DRAWS: dict[str, Draw] = {
     "electronics.gain_per_k": pad_value("gain_per_k"),
     "electronics.supply_drift_per_s": hand_rate("supply_drift_per_s"),
     **{f"shear.{entry.name}": shear_value(entry.name) for entry in dataclasses.fields(ShearSpread)},
+    "responses.film_unevenness": film_unevenness,
     **{f"responses.{entry.name}": response_value(entry.name) for entry in dataclasses.fields(HiddenResponse)},
 }
 

@@ -253,7 +253,9 @@ class TwoLayersTable(ResponseTable):
     lead_ohm: Annotated[tuple[NonNegative, ...], PER_CHANNEL] = Field(
         (0.0, 0.0, 0.0, 0.0), description="from electrodes x0, xa, y0, yb to their amplifiers"
     )
-    lead_std_ohm: NonNegative = Field(3.0, description="error of each of these (1 sigma)")
+    lead_std_ohm: NonNegative = Field(
+        3.0, description="error of each of these (1 sigma); of a lead of 0 ohm, the root mean square"
+    )
     unevenness_std: Annotated[float, Field(ge=0, le=1)] = Field(
         0.01, description="logarithm of a film's resistance at one end over that in the middle (1 sigma)"
     )

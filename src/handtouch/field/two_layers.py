@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from handtouch.field.surface_base import Surface
 
 FloatArray = npt.NDArray[np.float64]
 _IMAGES = 2  # on each side, and as many more per a / b; they fall by exp(-2 pi b / a) from one to the next
+_TINY = 1e-30  # variance of leads below which they are exact
 _LEAST_DISTANCE = 1e-9  # of an image, in sides: a contact on an insulated edge is as good as two
 
 
@@ -29,8 +31,8 @@ class TwoLayers(ChannelMap):
     current.
 
     ohm_per_square: of each film. lead_ohm: of the four electrodes, to their amplifiers. lead_std_ohm: their
-    standard deviation; unevenness_std: that of the logarithm of a film's resistance from one end to the
-    middle, and of shorter waves of it, each film's own.
+    standard deviation, if they could be below 0; unevenness_std: that of the logarithm of a film's resistance
+    from one end to the middle, and of shorter waves of it, each film's own.
     """
 
     def __init__(
@@ -45,11 +47,13 @@ class TwoLayers(ChannelMap):
     ) -> None:
         super().__init__(surface, 4, contact_radius_m)
         self.sheet_ohm_per_square = 2 * ohm_per_square
-        self._lead_std_ohm, self._unevenness_std = lead_std_ohm, unevenness_std
-        leads = np.reshape(lead_ohm, (2, 2))
+        self._unevenness_std = unevenness_std
+        known = np.array([_from_zero_on(ohm, lead_std_ohm) for ohm in lead_ohm])
+        leads, lead_stds = np.moveaxis(known.reshape(2, 2, 2), 2, 0)
         film = ohm_per_square * np.array([self.a / self.b, self.b / self.a])
         whole = film + leads.sum(axis=1)
-        self._begin, self._growth, self._per_ohm = leads[:, 0] / whole, film / whole, 1 / whole
+        self._begin, self._growth = leads[:, 0] / whole, film / whole
+        self._lead_variance = np.square(lead_stds / whole[:, None])
 
     def respond(self, x: FloatArray, y: FloatArray) -> FloatArray:
         return _pairs(*self._shares(x, y))
@@ -57,17 +61,18 @@ class TwoLayers(ChannelMap):
     def variation_slopes(self, x: npt.ArrayLike, y: npt.ArrayLike) -> FloatArray:
         """Return changes of each film: by what both leads shift alike, and by all else.
 
-        With l the deviation of a lead over the film's resistance, both leads have the variance l^2 ((1 - s)^2
-        + s^2) of a share s, of which l^2 / 2 is the same all over.
+        With the variances v and w of its leads over the film's resistance, that of a share s is v (1 - s)^2
+        + w s^2, of which v w / (v + w) is the same all over.
         """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         along, sides, none = (x / self.a, y / self.b), (self.a, self.b), np.zeros_like(x)
         found = np.zeros((VARIATIONS, self.channels, *x.shape))
         for film, share in enumerate(self._shares(x, y)):
-            by_lead = self._lead_std_ohm * self._per_ohm[film]
+            begin, end = self._lead_variance[film]
+            both = max(begin + end, _TINY)
             waves = _wave_variance(along[film], along[1 - film], sides[film] / sides[1 - film])
-            varying = np.sqrt(2 * (by_lead * (share - 0.5)) ** 2 + self._unevenness_std**2 * waves)
-            for number, change in enumerate((none + by_lead / math.sqrt(2), varying)):
+            varying = np.sqrt(both * (share - begin / both) ** 2 + self._unevenness_std**2 * waves)
+            for number, change in enumerate((none + math.sqrt(begin * end / both), varying)):
                 of_films = (change, none) if film == 0 else (none, change)
                 found[2 * film + number] = _pairs(*of_films, change=True)
         return found
@@ -88,6 +93,15 @@ def _pairs(of_xa: FloatArray, of_yb: FloatArray, *, change: bool = False) -> Flo
     """Return the signals (4, ...) of which those of both electrodes of a film sum to 1, or changes, to 0."""
     whole = 0.0 if change else 1.0
     return np.stack([whole - of_xa, of_xa, whole - of_yb, of_yb])
+
+
+def _from_zero_on(mean: float, std: float) -> tuple[float, float]:
+    """Return mean and deviation of what is above 0 of a normal distribution with this mean and deviation."""
+    if not std > 0:
+        return mean, 0.0
+    sigmas = mean / std
+    ratio = NormalDist().pdf(sigmas) / NormalDist().cdf(sigmas)
+    return mean + std * ratio, std * math.sqrt(1 - ratio * (sigmas + ratio))
 
 
 def _wave_variance(s: FloatArray, t: FloatArray, ratio: float) -> FloatArray:

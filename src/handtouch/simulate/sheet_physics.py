@@ -1,7 +1,7 @@
 """Behaviour of a simulated sheet under load: hysteresis, adaptation, creep, temperature, fluctuation.
 
 Public names: `SheetLaw` (parameters of one sheet) with its parts `ElementCreep`, `PowerCreep`, `BackForces`;
-`SheetStates`.
+`SheetStates`; `CALIBRATION_S`.
 
 It has more kinds than the compensation in `handtouch.sheet` and uses nothing of it. Parts act in one order:
 load -> + thermal preload -> hysteresis -> adaptation -> creep -> thermal gain -> fluctuation -> apparent.
@@ -10,7 +10,7 @@ load -> + thermal preload -> hysteresis -> adaptation -> creep -> thermal gain -
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Protocol
 
@@ -26,6 +26,8 @@ IntArray = NDArray[np.intp]
 
 _MAX_TURNS: Final = 128
 """Turning points of its load that a sheet remembers, of 64 nested cycles; the smallest are forgotten first"""
+CALIBRATION_S: Final = 1.0
+"""For how long a weight is held by which a sensor is calibrated: docs/responses.md"""
 _SHORTEST_S, _LONGEST_S = 1e-5, 1e9
 _ELEMENTS_PER_DECADE = 3
 
@@ -125,13 +127,19 @@ class SheetLaw:
     noise_std: float = 0.0
     """Relative standard deviation of flicker at 1 N; it goes as force^(-1/2)."""
     noise_time_s: float = 0.05
+    calibration_n: float | None = None
+    """Force that a new sheet reads as it is after `CALIBRATION_S`; None: as loops and creep make it."""
 
 
 class SheetStates:
     """States of `count` sheets of one law, that were never pressed."""
 
     def __init__(self, law: SheetLaw, count: int = 1) -> None:
-        self._law, self._count = law, count
+        self._law, self._count, self._gain = law, count, 1.0
+        if law.calibration_n is not None:
+            weighed = SheetStates(replace(law, calibration_n=None))
+            reading_n = weighed.advance(np.zeros(1, np.intp), CALIBRATION_S, law.calibration_n)
+            self._gain = law.calibration_n / float(reading_n[0])
         self._arrays = {
             "turning_n": np.zeros((count, _MAX_TURNS)),  # of the load: 0, maximum, minimum, ... and present
             "turns": np.ones(count, np.intp),  # of these points that still count
@@ -184,7 +192,7 @@ class SheetStates:
         excited[:] = is_excited
         memory: list[Any] = [array.data for array in (sheets, *columns[:2], excited, columns[2], apparent_n)]
         self._stage.advance(*memory)
-        return apparent_n
+        return apparent_n * self._gain
 
 
 def _states_of(law: SheetLaw, count: int, arrays: dict[str, NDArray[Any]]) -> SheetStates:

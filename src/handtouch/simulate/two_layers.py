@@ -22,7 +22,7 @@ from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.response_circuit import ResponseCircuit
 from handtouch.simulate.solved_contact import PatchNodes, solve_patches
 from handtouch.simulate.unevenness import Unevenness
-from handtouch.simulate.worlds.world import HiddenPad
+from handtouch.simulate.worlds.world import UNEVEN_MODES, HiddenPad
 
 FloatArray = NDArray[np.float64]
 _CELLS = 64  # along each side
@@ -62,7 +62,7 @@ def two_layer_circuit(
     pad: config.Pad, sheet: config.Sheet, drive_v: float, shape: SimulatedSurface, hidden: HiddenPad
 ) -> TwoLayerCircuit:
     """Return the true films of a pad; sheet: as built, of both films."""
-    unevenness = Unevenness(((1, 0), (0, 1), (1, 1), (2, 0), (0, 2)), hidden.unevenness, None)
+    unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness)
     leads = np.array(pad.response.lead_ohm) + np.array(hidden.series_ohm)  # type: ignore[union-attr]
     gaps_m = 1e-3 * np.stack([hidden.gap_before_mm, hidden.gap_after_mm], axis=1)
     at = (np.arange(_CELLS) + 0.5) / _CELLS
@@ -80,8 +80,6 @@ def two_layer_circuit(
         shape=shape,
         tables=tuple(shares),
         mixing=np.eye(4),
-        law=None,
-        signal_ratio=1.0,
         names=pad.electrode_names,
         sheet=sheet,
         drive_v=drive_v,

@@ -17,7 +17,7 @@ from handtouch.simulate.preisach import PlayLoops
 from handtouch.simulate.worlds.distributions import Distribution, Fixed
 from handtouch.simulate.worlds.sheet_kinds import SheetKind
 
-_CREEP_STD, _PER_LOOP_WIDTH = 0.12, 2.0
+_CREEP_STD, _PER_LOOP_WIDTH = 0.03, 2.0
 """Relative error of a force by an elastomer: by creep, and by loops, over their width on its data sheet."""
 _ZERO, _ONE = Fixed(0.0), Fixed(1.0)
 Draw = Callable[[Distribution, int, str], NDArray[np.float64]]
@@ -37,6 +37,8 @@ class ResponseSpread:
     """Share of each neighbour's signal that a channel reads besides its own, one value per pad."""
     tail: Distribution = _ZERO
     """Share of the response that is twice as wide, one value per pad."""
+    film_unevenness: Distribution = _ZERO
+    """Amplitude of each of the five smoothest waves of the logarithm of a film's resistance."""
     field_n: Distribution = _ZERO
     """Signal of a magnetic pad's channels in the Earth's field along their axes, as that of a force [N]."""
     field_tilt: Distribution = _ZERO
@@ -67,7 +69,11 @@ class ResponseSpread:
             "contact_elongation_std": of_films["contact_elongation_std"],
         }
         law_std = float(np.hypot(of_films["contact_ohm_std"], self._elastomer_std))
-        of_films = {**of_films, "contact_ohm_std": law_std}
+        of_films = {
+            **of_films,
+            "contact_ohm_std": law_std,
+            "unevenness_std": self.film_unevenness.std,
+        }
 
         def described(table: Any) -> Any:
             if not isinstance(table, config.ResponseTable):

@@ -109,6 +109,7 @@ ELASTOMER = SheetKind(
         gain_per_k=0.002,
         press_std=0.02,
         noise_std=0.002,
+        calibration_n=1.0,
     ),
     Behaviour(preset="unknown"),
 )

@@ -171,6 +171,7 @@ class DrawnWorld:
     def _draw_pad(self, link: str, pad: config.Pad) -> HiddenPad:
         parts, mounts, sheets = self.world.parts, self.world.mounts, self.world.sheets
         electronics = self.world.electronics
+        unevenness = self.world.responses.film_unevenness if pad.response else parts.unevenness
         rng = self._stream(link)
         count = len(pad.electrode_names)
         gain = parts.gain_ratio.sample(rng, count)
@@ -185,7 +186,7 @@ class DrawnWorld:
             gap_after_mm=_floats(gaps[count:]),
             sheet_ohm_ratio=self._number(parts.sheet_ohm_ratio, "sheet_ohm", link),
             anisotropy_ratio=self._number(parts.anisotropy_ratio, "anisotropy", link),
-            unevenness=tuple(self._numbers(parts.unevenness, len(UNEVEN_MODES), "unevenness", link).tolist()),
+            unevenness=tuple(self._numbers(unevenness, len(UNEVEN_MODES), "unevenness", link).tolist()),
             length_offset_mm=self._number(parts.length_offset_mm, "length", link),
             width_offset_mm=self._number(parts.width_offset_mm, "width", link),
             mount_offset_mm=_three(mounts.position_mm.sample(mount, 3)),
