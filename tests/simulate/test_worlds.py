@@ -96,7 +96,7 @@ def film_unevenness(drawn: DrawnWorld, _: config.Deployment) -> Any:
 
 
 @cache
-def two_layers() -> config.Hand:
+def two_layers() -> config.HandTable:
     return config.load(config.shipped.path("two_layers.toml")).hands[0]
 
 

@@ -183,7 +183,7 @@ class TaxelArray(ChannelMap):
         point, shape = self.surface.point(x, y), (-1, *(1,) * np.ndim(x))
         away = [point[axis] - places[:, axis].reshape(shape) for axis in range(3)]
         height = sum(one * self._normals[:, axis].reshape(shape) for axis, one in enumerate(away))
-        return np.maximum(sum(one * one for one in away) - height * height, 0.0)
+        return np.asarray(np.maximum(sum(one * one for one in away) - height * height, 0.0))
 
 
 def _tail(square: FloatArray) -> FloatArray:
