@@ -166,7 +166,8 @@ def state(cell: BoltWorkcell, steps: list[Step]) -> str:
 def digest() -> str:
     """Return a digest of the sources that the outcome depends on most."""
     files = [ROOT / "examples" / name for name in ("bolt_pose.py", "start_bolt.py")]
-    files += sorted((ROOT / "src/handtouch/simulate/tactile").glob("bolt_*.py"))
+    tactile = ROOT / "src/handtouch/simulate/tactile"
+    files += [tactile / "bolt_scene.py", tactile / "bolt_workcell.py"]
     own = [inspect.getsource(part).encode() for part in (LimitedCell, limited, episode)]
     return hashlib.sha256(b"".join([*(file.read_bytes() for file in files), *own])).hexdigest()[:12]
 

@@ -453,7 +453,7 @@ class BoltStarter:
             row = self._robot.links.index(link)
             position, rotation = compose(self._flange, self._arm.link("base", link))
             normal = touch.normal[row].astype(np.float64)
-            variance = float(normal @ touch.covariance_m2[row] @ normal)
+            variance = max(float(normal @ touch.covariance_m2[row] @ normal), 0.0)
             aside = (float(np.trace(touch.covariance_m2[row])) - variance) / 2
             point = position + rotation @ touch.position_m[row]
             if np.isfinite(point).all():

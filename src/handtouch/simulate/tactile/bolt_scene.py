@@ -108,7 +108,13 @@ class BoltScene:
         self.model: Any = spec.compile()
         self.data: Any = mujoco.MjData(self.model)
         self._bolt = self.model.body("bolt").id
+        self._on_bolt = self.model.geom_bodyid == self._bolt
         self._qpos = np.array([self.model.joint(name).qposadr[0] for name in self.joints])
+        self.restart(start)
+
+    def restart(self, start: BoltStart) -> None:
+        """Put everything back, and the bolt onto the table; place the arm then."""
+        mujoco.mj_resetData(self.model, self.data)
         self.arm = np.array([0.0, 0.0, 0.5]), np.eye(3)
         self.target_rad = np.zeros(len(self.joints))
         lying_m = np.array([start.x_m, start.y_m, self.bolt.head_flats_m / 2 + 1e-3])
@@ -151,6 +157,13 @@ class BoltScene:
         tip = position + self.bolt.total_m / 2 * rotation[:, 2]
         aside = np.hypot(*(tip - HOLE_M)[[0, 2]])
         return float(tip[1] - HOLE_M[1]) if aside < self.bolt.diameter_m / 2 else 0.0
+
+    @property
+    def hand_touches(self) -> bool:
+        """True if the hand touches the bolt."""
+        geom = self.data.contact.geom
+        others = self.model.geom_contype[geom][self._on_bolt[geom][:, ::-1]]
+        return bool((others == HAND_COLLISION_BIT).any())
 
     @property
     def deepest_m(self) -> float:

@@ -66,12 +66,27 @@ class BoltWorkcell:
         errors = drawn.joints(hand.name, len(self.joints))
         self._zero_rad, self._noise_rad = np.radians(errors.offset_deg), np.radians(errors.noise_deg)
         self._delay_steps = min(round(1e3 * errors.delay_s), self.touch.steps)
-        self._rng = np.random.default_rng((seed, 48))
+        self._begin_noise(seed)
 
     def close(self) -> None:
         """Stop the daemon, if there is one."""
         if isinstance(self.touch, ServedTouch):
             self.touch.close()
+
+    def restart(self, start: BoltStart, seed: int) -> None:
+        """Begin again with the bolt elsewhere, and the same hand; `seed` chooses the noise.
+
+        What follows is the same as after any other restart with them. Raises ValueError for a cell with a
+        daemon, which can't begin again.
+        """
+        if isinstance(self.touch, ServedTouch):
+            raise ValueError("a cell with a daemon can't begin again: make another one")
+        self.scene.restart(start)
+        self.touch.restart(seed)
+        self._begin_noise(seed)
+
+    def _begin_noise(self, seed: int) -> None:
+        self._rng = np.random.default_rng((seed, 48))
 
     def start_at(self, flange: Pose, joint_rad: FloatArray) -> None:
         """Put flange and joints somewhere at once, before the first `move`."""
