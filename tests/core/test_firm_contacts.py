@@ -30,12 +30,9 @@ DISC = np.array(
 class Hand:
     """The hand of config/utah_mit.toml, pressed by discs of uniform current at places (n, 2) of its pads."""
 
-    def __init__(self, seed: int, behaviour: Behaviour | None = None) -> None:
+    def __init__(self, seed: int, **of_sheets: object) -> None:
         deployment = load(shipped.path("utah_mit.toml"))
-        described = {
-            name: sheet.model_copy(update={"behaviour": behaviour})
-            for name, sheet in deployment.sheets.items()
-        }
+        described = {name: sheet.model_copy(update=of_sheets) for name, sheet in deployment.sheets.items()}
         self.deployment = deployment.model_copy(update={"sheets": described})
         self.model = build_pad_model(self.deployment)
         self.pads = [pad for _, pad in self.deployment.pads]
@@ -106,9 +103,14 @@ def test_no_contact_ends_or_loses_its_values_because_it_is_firm() -> None:
     assert np.mean(bounds) > 0.95
 
 
-def test_forces_of_firm_contacts_stay_bounds_on_sheets_with_a_behaviour() -> None:
+@pytest.mark.parametrize(
+    "of_sheets",
+    [{"behaviour": Behaviour(preset="S1")}, {"max_force_n": None}],
+    ids=["behaviour", "unknown greatest force"],
+)
+def test_forces_of_firm_contacts_stay_true_bounds(of_sheets: dict[str, object]) -> None:
     """While they are held, too, as uncertainties are updated ten times a second."""
-    hand, bounds = Hand(1, Behaviour(preset="S1")), []
+    hand, bounds = Hand(1, **of_sheets), []
     for _ in range(6):
         at = hand.rng.uniform(0.002, 0.998, (hand.size, 2))
         force_n = hand.rng.uniform(5.0, MAX_FORCE_N, hand.size)

@@ -196,6 +196,16 @@ def test_without_a_greatest_force_those_at_the_sheets_limit_are_lower_bounds(ben
     assert found < 30.0
 
 
+def test_a_current_far_above_all_that_the_law_allows_gives_no_greater_bound(bench: Any) -> None:
+    """It contradicts the law: parts, or where the contact is, are not as stated."""
+    model, place = bench.model, (bench.model.networks[0].a / 2, bench.model.networks[0].b / 2)
+    law, spreading_m = ContactLaw(2e-2, 1.5, 2.5e-3), float(model.networks[0].spreading_radius(*place))
+    greatest = float(law.current(1e6, 5.0, 2400.0, spreading_m)) * model.networks[0].fractions(*place)
+    bounds = [solve(model, excess * greatest) for excess in (1.0, 1.5, 2.0, 4.0)]
+    assert {status for _, _, status in bounds} == {ForceEstimateStatus.LOWER_BOUND}
+    assert all(0 < found <= bounds[0][0] for found, _, _ in bounds)
+
+
 EXACT = """contact_radius_std_mm = 0.0
 contact_ohm_std = 0.0
 alpha_std = 0.0

@@ -245,7 +245,8 @@ def estimate_force(
             evaluate(stack, law, result, log_x2)
         # without a greatest force, those from the limit on differ too little in current to have a mean
         if not sigma > (-_BOUND_SIGMA if is_limited else _UNLIMITED_SIGMA):
-            margin = max((sigma + _BOUND_SIGMA) * std, 0.0)
+            # a current far above all that the law allows contradicts it: the deviation is at least that far
+            margin = max(sigma + _BOUND_SIGMA, -sigma) * std
             if law.parameters[0].growth > 0.0:
                 result.left = total + margin
                 log_x2 = _find_likely(stack, law, result, result.left, least, top)
