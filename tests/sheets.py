@@ -1,10 +1,13 @@
-"""Readings of a sheet over time, by its forward model."""
+"""Readings of a sheet over time, by its forward model; creep by a power law."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from handtouch.sheet import SheetModel
+import numpy as np
+from scipy.optimize import nnls
+
+from handtouch.sheet import Creep, SheetModel
 
 
 def apparent_load(
@@ -22,3 +25,11 @@ def apparent_load(
         return float(rest.forward(state.copy(), load_n(t_s))[0])
 
     return at
+
+
+def power_law(exponent: float, modes: int = 7) -> Creep:
+    """Return elements with the response (t / 1 s)^exponent from 1 ms to 1 h, by least squares."""
+    t, times = np.geomspace(1e-3, 3600, 262), np.geomspace(1e-3, 3600, modes)
+    columns = np.column_stack([np.ones_like(t), -np.expm1(-t[:, None] / times)])
+    weights, _ = nnls(columns / t[:, None] ** exponent, np.ones_like(t))
+    return Creep(float(weights[0]), tuple(weights[1:].tolist()), tuple(times.tolist()))

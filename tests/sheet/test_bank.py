@@ -5,6 +5,7 @@ import numpy.typing as npt
 import pytest
 
 from handtouch.sheet import BANK_LEARNED, S1, S2, BankPrior, BankState, Creep, ModelBank, SheetModel
+from tests.sheets import power_law
 
 PERIOD_S = 1.0
 GRIPS = (16, 256) * 6
@@ -63,8 +64,8 @@ def test_adaptation_that_a_sheet_shows_stays_compensated() -> None:
 
 
 def test_slow_creep_is_learned_and_compensated() -> None:
-    hold = Hold(SheetModel(NOT_ADAPTING.adaptation, Creep.power_law(0.08)), NOT_ADAPTING)
-    assert Creep.power_law(0.08).response(128.0) > 1.4
+    hold = Hold(SheetModel(NOT_ADAPTING.adaptation, power_law(0.08)), NOT_ADAPTING)
+    assert power_law(0.08).response(128.0) > 1.4
     for long_s in GRIPS[:4]:
         hold.grip(long_s)
     force, _ = hold.grip(128)

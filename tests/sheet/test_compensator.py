@@ -13,7 +13,6 @@ from handtouch.host.units import GRAM_FORCE_N
 from handtouch.sheet import (
     S1,
     S2,
-    Creep,
     Fluctuation,
     ParameterUncertainty,
     PrandtlIshlinskii,
@@ -21,11 +20,12 @@ from handtouch.sheet import (
     SheetModel,
     TemperatureResponse,
 )
+from tests.sheets import power_law
 
 PADS = 6
 WHOLE = replace(
     S1,
-    creep=Creep.power_law(0.06, modes=5),
+    creep=power_law(0.06, modes=5),
     hysteresis=PrandtlIshlinskii.from_width(0.12, 5.0),
     temperature=TemperatureResponse(gain_per_k=0.01),
     fluctuation=Fluctuation(),

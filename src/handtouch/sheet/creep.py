@@ -16,8 +16,6 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-_FIT_PER_DECADE = 40
-
 
 @dataclass(frozen=True)
 class Creep:
@@ -48,29 +46,6 @@ class Creep:
         """Build one element; the final reading is the load."""
         return cls(instant, (1 - instant,), (time_s,))
 
-    @classmethod
-    def power_law(
-        cls, exponent: float, shortest_s: float = 1e-3, longest_s: float = 3600.0, modes: int = 7
-    ) -> Creep:
-        """Fit elements to the response (t / 1 s)^exponent from `shortest_s` to `longest_s`.
-
-        Least squares of the relative error on logarithmic time, with weights >= 0 (NNLS); see
-        `power_law_error`. exponent: 0 to 1, typically 0.02 to 0.1. Raises ValueError for an exponent out of
-        range, or too many decades for the modes.
-        """
-        from scipy.optimize import nnls  # slow to import, and rarely needed
-
-        if not 0 < exponent < 1:
-            raise ValueError(f"exponent must lie between 0 and 1, got {exponent}")
-        decades = np.log10(longest_s / shortest_s)
-        t = np.geomspace(shortest_s, longest_s, int(_FIT_PER_DECADE * decades))
-        times = np.geomspace(shortest_s, longest_s, modes)
-        columns = np.column_stack([np.ones_like(t), -np.expm1(-t[:, None] / times)])
-        weights, _ = nnls(columns / t[:, None] ** exponent, np.ones_like(t))
-        if weights[0] == 0:
-            raise ValueError(f"{modes} modes are too few for an exponent of {exponent}")
-        return cls(float(weights[0]), tuple(weights[1:].tolist()), tuple(times.tolist()))
-
     @property
     def total(self) -> float:
         """Final reading over load."""
@@ -81,11 +56,6 @@ class Creep:
         t = np.asarray(t_s, np.float64)[..., None]
         grown = -np.expm1(-t / np.array(self.times_s)) @ np.array(self.weights)
         return np.asarray(self.instant + grown)
-
-    def power_law_error(self, exponent: float, t_s: npt.ArrayLike) -> float:
-        """Return the largest relative deviation from (t / 1 s)^exponent at the given times."""
-        t = np.asarray(t_s, np.float64)
-        return float(np.abs(self.response(t) / t**exponent - 1).max())
 
     def initial_state(self, pads: int) -> FloatArray:
         """Return the state (1 + modes, pads) of sheets without load: the load, then each element's [N]."""
