@@ -1,9 +1,4 @@
-"""Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states.
-
-Public names: `pad_surface`, `mount_transform`, `electrode_network`, `network_parameters`, `pad_channels`,
-`pad_network`, `press_map`, `channel_gain_std`, `models_with_other_parts`, `part_stds`,
-`part_limits`.
-"""
+"""Hands: pads on links, robot descriptions (URDF), kinematic trees and joint states."""
 
 from handtouch.hand.pads import (
     MountUncertainty,
