@@ -133,6 +133,18 @@ def test_coverage_is_the_share_within_the_stated_intervals(ratio: float) -> None
     assert (other.force_coverage, other.force_valid) == (total.force_coverage, 0.0)  # it has an interval, too
 
 
+def test_lower_bounds_are_true_or_not_and_have_no_error() -> None:
+    truth = touch("tip", 0, 40)
+    contacts = follow(truth, np.zeros((40, 3)), 0.25)
+    below = [replace(contact, force_n=0.4, force_status="lower_bound") for contact in contacts[:9]]
+    above = replace(contacts[9], force_n=300.0, force_status="lower_bound")
+    score = score_contacts([*below, above, *contacts[10:]], truth)
+    assert score.total.rms_force_error_n == pytest.approx(0.25)
+    assert score.total.force_bounded == pytest.approx(0.25)
+    assert score.total.bounds_held == pytest.approx(0.9)
+    assert "25 % are lower bounds, 90 % of them true" in str(score)
+
+
 def test_samples_match_within_half_a_period_and_ends_never() -> None:
     truth = touch("tip", 0, 10)
     error = np.zeros((10, 3))

@@ -75,12 +75,17 @@ class LinkScore:
     position_coverage: float
     """Share of the `valid` positions on the pad within their stated 95 % region."""
     rms_force_error_n: float
+    """Of forces that aren't lower bounds."""
     force_coverage: float
     """Share of the forces within 1.96 of their stated standard deviations, `unreliable` ones included."""
     position_valid: float
     """Share of the positions whose status is `valid`."""
     force_valid: float
     """Share of the forces whose status is `valid`."""
+    force_bounded: float
+    """Share of the forces that are lower bounds."""
+    bounds_held: float
+    """Share of the lower bounds that are below the force."""
     touches: int
     missed: int
     """Touches without any contact sample."""
@@ -110,9 +115,12 @@ class Score:
             ]
         if not np.isnan(total.rms_force_error_n):
             held, valid = _percent(total.force_coverage), _percent(total.force_valid)
+            bounded, below = _percent(total.force_bounded), _percent(total.bounds_held)
+            bounds = [f"  {bounded} are lower bounds, {below} of them true;"] if total.force_bounded else []
             lines += [
                 f"force: {total.rms_force_error_n:.2f} N rms error;",
                 f"  {held} of values are in their 95 % intervals;",
+                *bounds,
                 f"  {valid} are valid, the others unreliable: a sheet counts as known",
                 "  after three touches of 5 s together",
             ]
@@ -207,15 +215,17 @@ class _MatchedLink:
             ]
         )
         forces = [
-            (c.force_n - record.force_n, c.force_std_n, c.force_status == "valid")
+            (c.force_n - record.force_n, c.force_std_n, c.force_status)
             for c, record, _ in pairs
             if c.force_n is not None
         ]
-        self.force_error_n = np.array([error for error, _, _ in forces])
+        self.force_error_n = np.array([error for error, _, status in forces if status != "lower_bound"])
         self.force_held = np.array(
             [abs(error) <= _95_PERCENT_SIGMA * std for error, std, _ in forces if std is not None]
         )
-        self.force_valid = np.array([is_valid for _, _, is_valid in forces])
+        self.force_valid = np.array([status == "valid" for _, _, status in forces])
+        self.force_bounded = np.array([status == "lower_bound" for _, _, status in forces])
+        self.bound_held = np.array([error <= 0 for error, _, status in forces if status == "lower_bound"])
 
 
 def _vectors(rows: Iterable[FloatArray]) -> FloatArray:
@@ -259,6 +269,8 @@ def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
         _mean(np.concatenate([found.force_held for found in matched])),
         _ratio(sum(len(found.position_held) for found in matched), len(length)),
         _mean(np.concatenate([found.force_valid for found in matched])),
+        _mean(np.concatenate([found.force_bounded for found in matched])),
+        _mean(np.concatenate([found.bound_held for found in matched])),
         sum(found.touches for found in matched),
         sum(found.missed for found in matched),
         sum(found.false_positives for found in matched),
