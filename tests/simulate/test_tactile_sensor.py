@@ -16,6 +16,7 @@ from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate import TactileReading, TactileSensor
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.tactile.live_sheet import LiveSheets
+from handtouch.simulate.tactile.mujoco_contacts import ContactReader
 from handtouch.simulate.worlds import SHEET_KINDS, PartSpread, Uniform, World
 from handtouch.wire import ForceStatus, PadState, PositionStatus
 
@@ -134,6 +135,33 @@ def test_an_environment_reads_as_if_it_were_alone(model: Any) -> None:
     assert every.position_m.shape == (3, 2, 3)
     assert every.touched[:, 0].tolist() == [True, False, False]
     assert (every.counts[1] != every.counts[2]).any()  # noise of their own
+
+
+def test_contacts_are_those_of_the_states_that_are_given(model: Any) -> None:
+    """Also of states that were read before without a contact, and of others in their place."""
+    reader = ContactReader([entry.pad for entry in HAND.pads], model, {})
+    near, far = mujoco.MjData(model), mujoco.MjData(model)
+    near.qpos[0], far.qpos[0] = -1e-4, 1.0
+    assert not len(reader.read([near, far]).pad)  # before the first step
+    for state in (near, far):
+        mujoco.mj_step(model, state)
+    assert reader.read([near, far]).environment.tolist() == [0]
+    assert reader.read([far, near]).environment.tolist() == [1]
+    assert reader.read([near]).environment.tolist() == [0]
+    near.qpos[0] = 1.0
+    mujoco.mj_step(model, near)
+    assert not len(reader.read([near]).pad)
+
+
+def test_copies_of_a_hand_share_their_tables() -> None:
+    """256 hands of 15 pads would fill the processor's caches otherwise."""
+    hand = HAND.hands[0]
+    hands = tuple(hand.model_copy(update={"name": name}) for name in ("a", "b"))
+    pads = build_pad_model(HAND.model_copy(update={"hands": hands}))
+    own = len(hand.pads)
+    for made in (pads.surface_tables, pads.stage_tolerances(), pads.stage_tables()):
+        assert made[0] is made[own]
+        assert made[0] is not made[1]
 
 
 def test_every_environment_has_the_world_of_its_seed(model: Any) -> None:

@@ -1,7 +1,7 @@
 """Random numbers as a function of key and time, independent of the order of requests.
 
-Public names: `stream_key`, `standard_normal`, `random_walk`. Numbers are hashes (SplitMix64's finaliser) of
-key and time, so that a day of samples needs neither state nor a loop.
+Public names: `stream_key`, `standard_normal`, `mix_keys`, `normal_of_mixed`, `random_walk`. Numbers are
+hashes (SplitMix64's finaliser) of key and time, so that a day of samples needs neither state nor a loop.
 """
 
 from __future__ import annotations
@@ -34,9 +34,21 @@ def stream_key(seed: int, *names: str) -> np.uint64:
     return np.uint64(zlib.crc32("/".join(names).encode()) | (zlib.crc32(str(seed).encode()) << 32))
 
 
+def mix_keys(keys: ArrayLike) -> KeyArray:
+    """Return keys as `normal_of_mixed` takes them, to mix those once that are used again and again."""
+    with np.errstate(over="ignore"):
+        return _mix_bits(np.asarray(np.asarray(keys, np.uint64) + np.uint64(0x9E3779B97F4A7C15)))
+
+
+def normal_of_mixed(mixed_keys: KeyArray, counters: ArrayLike) -> FloatArray:
+    """Return `standard_normal` of keys that `mix_keys` returned."""
+    uniform = _uniform(mixed_keys, counters)
+    return np.asarray(ndtri(uniform, out=uniform) if uniform.ndim else ndtri(uniform))
+
+
 def standard_normal(keys: ArrayLike, counters: ArrayLike) -> FloatArray:
     """Return standard normal numbers (...) of integer keys and counters, which broadcast."""
-    return np.asarray(ndtri(_uniform(keys, counters)))
+    return normal_of_mixed(mix_keys(keys), counters)
 
 
 def random_walk(keys: KeyArray, times_s: ArrayLike) -> FloatArray:
@@ -71,7 +83,7 @@ def _sum_waves(keys: KeyArray, times_s: FloatArray) -> FloatArray:
 def _wave_ends(keys: KeyArray, numbers: NDArray[np.int64]) -> FloatArray:
     """Return the values (keys, 2, periods, times) of waves at both ends of a period, by its number."""
     first = (numbers << 4) + np.arange(len(_PERIODS_S))[:, None]
-    return 2 * _uniform(keys[:, None, None, None], np.stack([first, first + (1 << 4)])) - 1
+    return 2 * _uniform(mix_keys(keys)[:, None, None, None], np.stack([first, first + (1 << 4)])) - 1
 
 
 @lru_cache(maxsize=4096)
@@ -80,12 +92,11 @@ def _wave_ends_at(keys: bytes, numbers: tuple[int, ...]) -> FloatArray:
     return _wave_ends(np.frombuffer(keys, np.uint64), np.array(numbers)[:, None])
 
 
-def _uniform(keys: ArrayLike, counters: ArrayLike) -> FloatArray:
+def _uniform(mixed_keys: KeyArray, counters: ArrayLike) -> FloatArray:
     """Return uniform numbers in the open interval from 0 to 1."""
     with np.errstate(over="ignore"):
-        mixed = _mix_bits(np.asarray(np.asarray(keys, np.uint64) + np.uint64(0x9E3779B97F4A7C15)))
         of_counters = np.asarray(counters, np.int64).astype(np.uint64) * np.uint64(0xD1B54A32D192ED03)
-        mixed = _mix_bits(np.asarray(mixed ^ of_counters))
+        mixed = _mix_bits(np.asarray(mixed_keys ^ of_counters))
     mixed >>= np.uint64(11)
     uniform = np.asarray(mixed.astype(np.float64))
     uniform += 0.5

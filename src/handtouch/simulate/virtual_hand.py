@@ -84,6 +84,7 @@ class VirtualHand:
         self._bank = SheetMapBank(self._circuits.maps) if self._circuits else None
         self._noise = np.array([row.noise_counts for row in self.virtual_pads])
         self._keys = _padded([row.noise_keys for row in self.virtual_pads])
+        self._mixed_keys = noise.mix_keys(self._keys[:0])  # (hands, pads, c), of the hands asked for last
         self._gains = _padded([row.counts_per_ampere for row in self.virtual_pads])
         self._low = _padded([row.limits[:, 0] for row in self.virtual_pads])
         self._high = _padded([row.limits[:, 1] for row in self.virtual_pads])
@@ -165,8 +166,10 @@ class VirtualHand:
     def untouched_counts(self, t_s: float, hands: int = 1) -> FloatArray:
         """Return zeros and noise (hands, pads, c) [counts] at `t_s`, of hands that differ in noise only; the
         first one is that of `sample`."""
-        keys = self._keys + (np.arange(hands, dtype=np.uint64) * _KEY_STEP)[:, None, None]
-        counts = noise.standard_normal(keys, round(t_s * 1e9))
+        if len(self._mixed_keys) != hands:
+            of_hands = (np.arange(hands, dtype=np.uint64) * _KEY_STEP)[:, None, None]
+            self._mixed_keys = noise.mix_keys(self._keys + of_hands)
+        counts = noise.normal_of_mixed(self._mixed_keys, round(t_s * 1e9))
         counts *= self._noise[:, None]
         if not self._drift.is_constant:
             counts += self._drift.zero_counts(np.array([t_s]))

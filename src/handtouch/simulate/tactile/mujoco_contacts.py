@@ -66,19 +66,21 @@ class ContactReader:
             )
         self._curvature = np.array([_curvature(model, geom) for geom in range(model.ngeom)])
         self._states: list[Any] = []
-        self._views: list[tuple[Any, FloatArray, FloatArray]] = []
+        self._views: tuple[list[Any], list[FloatArray], list[FloatArray]] = [], [], []
         """of the states read last: contacts, and rotations and positions of bodies; they follow each step"""
 
     def read(self, states: Sequence[Any]) -> LinkPoints:
         """Return the contacts of environments with the data `states`, after a step or mj_forward."""
         if len(states) != len(self._states) or not all(map(operator.is_, states, self._states)):
             self._states = list(states)
-            self._views = [(data.contact, data.xmat, data.xpos) for data in states]
-        found = [(number, *views) for number, views in enumerate(self._views) if len(views[0])]
-        if not found:
+            contacts = [data.contact for data in states]
+            self._views = contacts, [data.xmat for data in states], [data.xpos for data in states]
+        in_all = list(map(len, self._views[0]))
+        owners = [number for number, count in enumerate(in_all) if count]
+        if not owners:
             return NO_POINTS
-        owners, contacts, rotations, positions = zip(*found, strict=True)
-        counts = [len(each) for each in contacts]
+        contacts, rotations, positions = ([views[number] for number in owners] for views in self._views)
+        counts = [in_all[number] for number in owners]
         geoms = np.concatenate([each.geom for each in contacts])
         owner = np.repeat(np.arange(len(owners)), counts)
         side, pad, contact = np.nonzero(self._senses[:, geoms.T].transpose(1, 0, 2))

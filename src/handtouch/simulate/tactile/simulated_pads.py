@@ -103,8 +103,10 @@ class SimulatedPads:
     def _currents(self, t_s: float, discs: _Discs) -> tuple[IntArray, IntArray, FloatArray]:
         """Return hands, pads (k,) and currents (k, 4) [A], at the nominal voltage, of the touched pads."""
         force_n = discs.force_n * self._force_ratio(t_s, discs)
-        same = np.diff(discs.key, prepend=-1, append=-1) == 0  # they are in order
-        alone = ~(same[1:] | same[:-1])
+        key = discs.key  # they are in order
+        alone = np.ones(len(key), np.bool_)
+        alone[1:] = other = key[1:] != key[:-1]
+        alone[:-1] &= other
         patch = evenly_pressed(discs.radius_m[alone])
         hands, pads = [discs.hand[alone]], [discs.pad[alone]]
         position = discs.position[alone].T
