@@ -157,13 +157,16 @@ class NodeSystems:
         count, nodes = len(patches), self.nodes
         for k in range(count):
             first, at = patches[k] * nodes, k * nodes
-            log_force = math.log(force_n[k] / layer[count + k])
+            log_force, specific = math.log(force_n[k] / layer[count + k]), 0.0
             for i in range(nodes):
                 row = i * nodes
                 for j in range(i, nodes):
                     self.system[row + j] = sheet_ohm[k] * self.green[first * nodes + row + j]
-                log_ratio = log_force + math.log(self.pressure[first + i])
-                specific = layer[k] * math.exp(-layer[2 * count + k] * log_ratio)
+                if (
+                    i == 0 or self.pressure[first + i] != self.pressure[first + i - 1]
+                ):  # else the same, as under even pressure
+                    log_ratio = log_force + math.log(self.pressure[first + i])
+                    specific = layer[k] * math.exp(-layer[2 * count + k] * log_ratio)
                 self.system[row + i] += specific / self.area_m2[first + i]
                 current[at + i] = 1.0
             _solve_symmetric(self.system, nodes, current, at)
