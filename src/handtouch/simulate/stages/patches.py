@@ -162,9 +162,8 @@ class NodeSystems:
                 row = i * nodes
                 for j in range(i, nodes):
                     self.system[row + j] = sheet_ohm[k] * self.green[first * nodes + row + j]
-                if (
-                    i == 0 or self.pressure[first + i] != self.pressure[first + i - 1]
-                ):  # else the same, as under even pressure
+                # under an even pressure, all nodes conduct alike
+                if i == 0 or self.pressure[first + i] != self.pressure[first + i - 1]:
                     log_ratio = log_force + math.log(self.pressure[first + i])
                     specific = layer[k] * math.exp(-layer[2 * count + k] * log_ratio)
                 self.system[row + i] += specific / self.area_m2[first + i]
