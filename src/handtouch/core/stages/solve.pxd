@@ -4,7 +4,7 @@ from handtouch.core.stages cimport elongation, force, locate, pairs, tables, tol
 from handtouch.core.stages.rows cimport MisfitRow, MountRow, PartRow, ValueRow
 
 cdef Py_ssize_t _UNKNOWNS
-cdef double _WIDE, _ESTIMATED, _ASSUMED, _CONTRADICTORY
+cdef double _PART_ASIDE, _WIDE, _ESTIMATED, _ASSUMED, _CONTRADICTORY
 cdef double _MIN_PEAK, _UNIFORM_VARIANCE, _MAX_VARIANCE, _MISFIT_CONTACTS, _MIN_LASTING_MISFIT
 cdef double _TWO_PI, _INFINITY
 cdef double _PART_MOTION, _MOTION_ALONG, _MOTION_ACROSS
@@ -75,6 +75,10 @@ cdef void _name_part(PartRow[::1] parts, Py_ssize_t row, Py_ssize_t first) noexc
 @cython.locals(row=Py_ssize_t, k=Py_ssize_t, i=Py_ssize_t, begin=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit,
                table=locate.ModelTable, at=tables.Placement)
 cdef void _resolve_pair(ContactSolver solver, Py_ssize_t pad) noexcept
+@cython.locals(other=Py_ssize_t, fit=locate.Fit, pair=pairs.PairFit, table=locate.ModelTable,
+               result=force.ForceResult, scale_m=double, dx=double, dy=double, d2=double, mutual=double, slope_x=double,
+               slope_y=double, shift=double, shift_x=double, shift_y=double, aside2=double)
+cdef void _add_part_crowding(ContactSolver solver, Py_ssize_t pad, Py_ssize_t k) noexcept
 @cython.locals(other=Py_ssize_t, n=Py_ssize_t, step=Py_ssize_t, fit=locate.Fit,
                pair=pairs.PairFit, law=force.PadLaw, table=locate.ModelTable, gradient2=double)
 cdef void _estimate_part_force(ContactSolver solver, Py_ssize_t pad, Py_ssize_t k, Py_ssize_t row) noexcept

@@ -85,6 +85,9 @@ _NAN = float("nan")
 _FITTED, _BOUNDED, _WIDE = float(force.FITTED), float(force.BOUNDED), float(force.WIDE)
 _, _ESTIMATED, _ASSUMED, _CONTRADICTORY = map(float, ContactRadiusStatus)
 _BOUND_SIGMA = contact_law.BOUND_SIGMA
+_PART_ASIDE = 0.5
+"""Deviation aside of how far one of two contacts' current is from its centre, over that: the other's
+potential is that in a disc. Of two ideal presses on a tuning pad of six electrodes it was 0 and 0.4"""
 _MAX_SQUARED_MISFIT = MAX_SQUARED_MISFIT
 _MAX_EXTENT_SIDES = 0.5
 _MIN_TURNED, _MIN_STEEPNESS, _MIN_DETERMINANT = 0.3, 1e-9, 1e-9
@@ -461,12 +464,40 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
         solver.parts[row].position_m[0], solver.parts[row].normal[0] = at.px, at.nx
         solver.parts[row].position_m[1], solver.parts[row].normal[1] = at.py, at.ny
         solver.parts[row].position_m[2], solver.parts[row].normal[2] = at.pz, at.nz
+        if solver.crowding[pad]:
+            _add_part_crowding(solver, pad, k)
         _add_motion(solver, _PART_MOTION)
         _add_size(solver, pad)
         _add_overhang(solver, pad)
         _find_covariance(solver)
         for i in range(9):
             solver.parts[row].covariance_m2[i] = solver.covariance[i]
+
+
+def _add_part_crowding(solver: ContactSolver, pad: int, k: int) -> None:
+    """Add to the covariance of contact k of a pair how far the centre of its current is from its own.
+
+    It is turned towards edges, as that of one contact, and away from the other contact, whose potential is
+    that of `_estimate_part_force`; neither is corrected.
+    """
+    fit, pair, table, result = solver.fit, solver.pair, solver.models[pad], solver.result
+    other, scale_m = 1 - k, solver.placement.scale_m
+    force.find_crowding(
+        solver.stack, solver.laws[pad], result, pair.total[k], pair.spreading[k] + math.log(scale_m), 0.0
+    )
+    dx = fit.x - locate.coordinate(table.nodes_x, table.cells, pair.place[2 * other])
+    dy = fit.y - locate.coordinate(table.nodes_y, table.cells, pair.place[2 * other + 1])
+    d2 = dx * dx + dy * dy
+    mutual = math.exp(pair.spreading[k] + pair.spreading[other]) / d2
+    mutual *= pair.total[other] / pair.total[k] / (1.0 + mutual)
+    slope_x, slope_y = pair.spreading[2 + k] / fit.scale_x, pair.spreading[4 + k] / fit.scale_y
+    shift = 0.5 * result.turning * result.square / (scale_m * scale_m)
+    shift_x = shift * (slope_x + mutual * (slope_x - 2.0 * dx / d2))
+    shift_y = shift * (slope_y + mutual * (slope_y - 2.0 * dy / d2))
+    aside2 = _PART_ASIDE * _PART_ASIDE * (shift_x * shift_x + shift_y * shift_y)
+    fit.var_x += shift_x * shift_x + aside2
+    fit.var_y += shift_y * shift_y + aside2
+    fit.cov_xy += shift_x * shift_y
 
 
 def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> None:
