@@ -17,13 +17,14 @@ from __future__ import annotations
 import itertools
 import os
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.hand_touches import serve, tangent_basis
+from benchmarks.hand_touches import position_error, serve
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import ClusterShare
 from handtouch import wire
@@ -99,12 +100,10 @@ def columns_of(found: list[wire.Contact | None], truth: GroundTruth) -> tuple[fl
     judged = found[JUDGED]
     known = [one for one in found if one and one.position_m is not None and one.force_n is not None]
     lost = len(known) < len(found) or len({one.id for one in known}) > 1
-    located = inside = False
-    if judged and judged.position_status == VALID and judged.position_m and judged.covariance_m2:
-        across = tangent_basis(np.array(truth.normal))
-        error = across @ np.subtract(judged.position_m, truth.position_m)
-        covariance = across @ np.reshape(judged.covariance_m2, (3, 3)) @ across.T
-        located, inside = True, bool(error @ np.linalg.solve(covariance, error) < IN_REGION)
+    with_mounts = judged and replace(judged, mount_covariance_m2=None)  # they are drawn here
+    error, covariance = position_error(with_mounts, truth)
+    located = bool(np.isfinite(error).all())
+    inside = located and bool(error @ np.linalg.solve(covariance, error) < IN_REGION)
     valid = judged is not None and judged.force_status == VALID and judged.force_std_n is not None
     bound = judged is not None and judged.force_status == BOUND
     true = False
