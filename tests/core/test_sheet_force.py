@@ -201,6 +201,32 @@ def test_the_error_of_the_contact_law_counts_once() -> None:
     assert rig.compensation.std_n[0] == pytest.approx(rig.compensation.std_n[1], rel=1e-6)
 
 
+def test_forces_by_a_law_of_small_error_are_as_certain_as_that_law() -> None:
+    behaviour = Behaviour(preset="S1", press_std=0.0, slow_creep=0.0, back_force_std_n=0.0)
+    rig = Rig(2, calm(sheet.S1), sheet_behaviour_of(behaviour))
+    rig.run(2.0, np.full(2, 3.0))
+    rig.tick_state.uncompensated_std_n[:] = rig.apparent * [0.0, 0.02]
+    for _ in range(2):
+        rig.t_ns += PERIOD_NS
+        rig.compensation.compensate_forces(rig.t_ns)
+        rig.compensation.complete_update()
+    without, with_law = rig.compensation.std_n
+    assert with_law == pytest.approx(np.hypot(without, 0.02 * 3.0), rel=0.02)
+    assert without < 0.03 * 3.0
+
+
+def test_slow_creep_that_is_not_learned_yet_is_as_uncertain_as_stated() -> None:
+    variances = []
+    for slow_creep in (0.0, 0.02, 0.04):
+        behaviour = Behaviour(preset="S1", press_std=0.0, slow_creep=slow_creep, back_force_std_n=0.0)
+        rig = Rig(1, calm(sheet.S1), sheet_behaviour_of(behaviour))
+        rig.run(1.9, np.full(1, 3.0))
+        variances.append(rig.compensation.std_n[0] ** 2)
+    none, some, twice = variances
+    assert some > none
+    assert twice - none == pytest.approx(4 * (some - none), rel=1e-3)
+
+
 def test_a_sheet_that_does_not_adapt_has_no_adapted_force_from_earlier_loads() -> None:
     behaviour = sheet_behaviour_of(Behaviour(adaptation_share=0.0, back_force_std_n=0.3))
     assert Rig(1, QUICK, behaviour).compensation.back_force[1][0] == 0

@@ -348,17 +348,17 @@ class Behaviour(Table):
     gain_std: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None,
         description="relative error of forces on a fresh sheet, common to all presses (1 sigma), where that "
-        "of the contact law isn't larger; default: 0.04, that of contact_ohm_std; of an unknown sheet 0.15, "
-        "as its hysteresis isn't known",
+        "of the contact law isn't larger; default: 0; of an unknown sheet 0.15, as its hysteresis isn't "
+        "known",
         examples=[0.04],
     )
     parameter_std_fraction: Annotated[float, Field(ge=0, le=1)] = Field(
         0.2, description="relative error of the parameters of creep, adaptation and hysteresis (1 sigma)"
     )
     slow_creep: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.02,
-        description="relative growth of a reading each time that a touch lasts e times longer (1 sigma, from "
-        "0.05 on): creep by a power law, which is learned from use",
+        0.05,
+        description="relative growth of a reading each time that a touch lasts e times longer (1 sigma): "
+        "creep by a power law, which is learned from use",
     )
     forget_time_s: Positive = Field(
         45.0,

@@ -33,8 +33,8 @@ _MIN_CONTACTS, _MIN_TOUCHED_S = 3, 5.0  # evidence before forces are reliable
 _MIN_FORCE_N = 1e-6
 _MIN_UNTOUCHED_PROBABILITY = 0.3  # that no undetected press occurred in a pause, however long
 _MAX_FORCE_STD_FRACTION = 1.0  # deviation over the force: above it, the force is unreliable
-_GAIN_STD, _UNKNOWN_GAIN_STD = 0.04, 0.15
-"""Relative errors of measured sheets, contact_ohm_std / alpha, and of one that wasn't: its loops, too."""
+_UNKNOWN_GAIN_STD = 0.15
+"""Relative error of a sheet that wasn't measured: its loops, too"""
 _HOUR_S = 3600.0
 _LOG_GAIN_STD_PER_HOUR = 0.05  # random walk of a pad's gain
 _MAX_LOG_GAIN_RATE_PER_S = 0.02  # so that no reference makes forces jump
@@ -539,10 +539,10 @@ def sheet_behaviour_of(behaviour: Behaviour, material: str = "") -> SheetBehavio
 
 
 def _gain_std_of(behaviour: Behaviour) -> float:
-    """Return the relative error of forces on a fresh sheet that is common to all presses."""
+    """Return the relative error of forces on a fresh sheet beyond the law's, common to all presses."""
     if behaviour.gain_std is not None:
         return behaviour.gain_std
-    return _UNKNOWN_GAIN_STD if behaviour.preset == "unknown" else _GAIN_STD
+    return _UNKNOWN_GAIN_STD if behaviour.preset == "unknown" else 0.0
 
 
 def _prior_of(behaviour: Behaviour) -> sheet.BankPrior:
@@ -553,5 +553,5 @@ def _prior_of(behaviour: Behaviour) -> sheet.BankPrior:
     return sheet.BankPrior(
         log_time_std=0.25 if measured else 0.5,
         not_adapting=0.01 if measured else 0.15,
-        exponent_std=max(behaviour.slow_creep, 0.05),
+        exponent_std=behaviour.slow_creep,
     )
