@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -74,3 +76,37 @@ def test_untouched_pads_transmit_on_change_and_touched_ones_with_sync(rig: Any) 
                 at_full_rate += message.sampling == "sync"
     idle = [pad for pad in rig.status()["pads"] if pad["sampling"] == "event"]
     assert all(pad["state"] in ("clear", "touched") for pad in idle)  # rare samples are no stale ones
+
+
+def test_without_a_subscriber_one_wake_up_reads_all_samples_of_a_tick(rig: Any) -> None:
+    rig.simulate()
+    rig.start("run")
+    rig.wait(
+        "15 nodes operational", lambda s: [p["node_state"] for p in s["pads"]].count("operational") == 15
+    )
+    time.sleep(1.0)
+    before, waits = rig.status(), waits_of(rig.status()["service"]["pid"])
+    time.sleep(3.0)
+    waits = waits_of(before["service"]["pid"]) - waits
+    after = rig.status()
+    service, loop = after["service"], after["service"]["loop"]
+    ticks = service["ticks"] - before["service"]["ticks"]
+    assert waits < 1.5 * ticks  # its frames come at several times
+    late = sum(loop["late"].values()) - sum(before["service"]["loop"]["late"].values())
+    assert late <= 0.02 * ticks
+    assert 0 < service["tick_us"]["p50"] < 5000
+    samples = [
+        new["samples"] - old["samples"] for new, old in zip(after["pads"], before["pads"], strict=True)
+    ]
+    assert min(samples) >= 0.98 * ticks
+    with rig.subscribe("contact/*/*") as contacts:
+        first = next(message for message in iter(lambda: contacts.recv(30), None) if not message.retained)
+    assert first.age_s < 0.05
+    assert first.begin_ns <= first.t_ns
+
+
+def waits_of(pid: int) -> int:
+    """Return how often a process's first thread has waited."""
+    lines = Path(f"/proc/{pid}/task/{pid}/status").read_text().splitlines()
+    (count,) = (line.split()[1] for line in lines if line.startswith("voluntary_ctxt_switches"))
+    return int(count)

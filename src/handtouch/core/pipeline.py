@@ -73,6 +73,7 @@ class Pipeline:
         self._sink = sink
         self.journal = TickJournal(self, session, sink)
         self._recorded = False  # the last tick
+        self._prepared = False  # the next tick
         self._expected_pads = self.tick.expected_pads()
         self._expected_count = 0
 
@@ -163,7 +164,9 @@ class Pipeline:
 
     def prepare_next_tick(self) -> None:
         """Do the part of the next tick that can be done in advance; at the latest when that begins."""
-        self.tick.prepare_next_tick()
+        if not self._prepared:
+            self._prepared = True
+            self.tick.prepare_next_tick()
 
     def end_session(self, now_ns: int) -> None:
         """Send the end of every contact and a last frame of every hand, because the daemon stops."""
@@ -181,7 +184,7 @@ class Pipeline:
         events, self._events = self._events, []
         for event in events:
             event.apply(self)
-        self.cycle.ticked = True
+        self.cycle.ticked, self._prepared = True, False
         tick, messages = self.tick, self.messages
         result = run_tick(tick, self.slab, self.node_state, self.cycle, until_ns)
         if self.transforms.any_requested:

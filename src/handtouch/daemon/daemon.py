@@ -67,6 +67,10 @@ _log = logging.getLogger("handtouch.daemon")
 
 _BACKGROUND_PERIOD_NS = 9_000_000
 """Least period of polling nodes, buses, health and requests; two ticks at 200 Hz, more at higher rates"""
+_UNHURRIED_BACKGROUND_PERIOD_NS = 19_000_000
+"""The same, and of polling inputs, while nobody waits for ticks: a subscriber is served four ticks later"""
+_UNHURRIED_PREFIXES = (wire.HEALTH.prefix.encode(), wire.SERVICE.prefix.encode())
+"""Topics whose subscribers wait for no tick"""
 _LOGGED_PAUSE_NS = 100_000_000
 _MESSAGE_PATH_THREADS = 3
 """Threads that a message passes, each waking the next: ZeroMQ's on both sides, and the subscriber's"""
@@ -109,6 +113,9 @@ class HandtouchDaemon(Closing):
         self.inputs, self.ports, self.pipeline = resources.inputs, resources.ports, resources.pipeline
         self._stack = resources.stack
         self._next_background_ns = 0
+        self._subscribed = False
+        self._hurried = True
+        """somebody waits for ticks or for nodes that boot; else the samples of a tick are read all at once"""
         self._sent_ns = 0  # when the last tick's messages were sent
         settings, pipeline, inputs, publisher = deployment.daemon, self.pipeline, self.inputs, self.publisher
         period_ns, session = pipeline.cycle.period_ns, publisher.session
@@ -254,12 +261,18 @@ class HandtouchDaemon(Closing):
         while not stop.is_set():
             now_ns = time.monotonic_ns()
             wake_ns = min(sync.wake_ns, master.wake_ns)  # node time-outs may come before a slow SYNC
+            watched = descriptors
             if not cycle.ticked:
-                sleep_ns = busy_poll.max_sleep_ns(cycle.sync_ns, now_ns)
-                wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns, now_ns + sleep_ns)
+                if self._hurried:
+                    sleep_ns = busy_poll.max_sleep_ns(cycle.sync_ns, now_ns)
+                    wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns, now_ns + sleep_ns)
+                else:  # one wake-up reads all samples: with the loop's own SYNC that sends the next one
+                    watched = []
+                    if not sync.is_timed:
+                        wake_ns = min(wake_ns, cycle.sync_ns + cycle.window_ns)
             wait_s = max(0, wake_ns - now_ns) * 1e-9
             pause.begin_wait(now_ns)
-            readable = select.select(descriptors, (), (), wait_s)[0]
+            readable = select.select(watched, (), (), wait_s)[0]
             woke_ns = time.monotonic_ns()
             stages.record_wait(wake_ns, woke_ns)
             if paused_ns := pause.end_wait(wake_ns, woke_ns):
@@ -310,13 +323,19 @@ class HandtouchDaemon(Closing):
     def _begin_cycle(self, sync_ns: int, now_ns: int, on_tick: Callable[[int], None]) -> None:
         """Begin a cycle at a SYNC that was sent or received.
 
-        The previous tick comes first if it is still due, as every tick is where the machine is too slow.
+        The previous tick comes first if it is still due, as every tick is where the machine is too slow, or
+        where nobody waits for it.
         """
-        self.reporter.stage_timer.begin_period(self.sync.overruns, not self.pipeline.cycle.ticked)
-        self.inputs.poll(now_ns)
+        hurried = self._hurried
+        unticked = hurried and not self.pipeline.cycle.ticked
+        self.reporter.stage_timer.begin_period(self.sync.overruns, unticked)
+        if hurried or now_ns >= self._next_background_ns:
+            self.inputs.poll(now_ns)
         if (felt := self.gravity.update_felt(now_ns)) is not None:
             self.pipeline.set_felt_gravity(felt)
         if (late := self.pipeline.finish_cycle(sync_ns, now_ns)) is not None:
+            if not hurried:
+                self.reporter.record_tick(now_ns, self._sent_ns, due_periods=2)
             self._complete_tick(late, on_tick)
         self.pipeline.begin_cycle(sync_ns, now_ns)
         self.reporter.stage_timer.lap(stage_timer.SYNC, time.monotonic_ns())
@@ -346,6 +365,9 @@ class HandtouchDaemon(Closing):
         self, requested: RequestedOutputs, needs: SceneRequirements, enabled: NDArray[np.bool_], now_ns: int
     ) -> None:
         """Apply the outputs that scenes and subscriptions request."""
+        self._subscribed = not all(
+            prefix.startswith(_UNHURRIED_PREFIXES) for prefix in self.publisher.subscriptions
+        )
         self.pipeline.apply_demand(requested, self.demand.ticks_per_hand_frame)
         self.percepts.set_requested(requested, now_ns)
         self._raw_pads = needs.raw
@@ -373,8 +395,9 @@ class HandtouchDaemon(Closing):
             self.supervisor.process_tick(now_ns)
             lap(stage_timer.SUPERVISE, time.monotonic_ns())
         if now_ns >= self._next_background_ns:
-            self._next_background_ns = now_ns + _BACKGROUND_PERIOD_NS
             self._run_background_tasks(now_ns)
+            period_ns = _BACKGROUND_PERIOD_NS if self._hurried else _UNHURRIED_BACKGROUND_PERIOD_NS
+            self._next_background_ns = now_ns + period_ns
         on_tick(now_ns)
         lap(stage_timer.REQUESTS, time.monotonic_ns())
 
@@ -391,6 +414,7 @@ class HandtouchDaemon(Closing):
         self.publisher.poll_subscriptions(now_ns)
         self.demand.update(now_ns)
         self.control.poll(now_ns)
+        self._hurried = self._subscribed or self.sampling.slow_sync or self.master.is_booting
 
 
 def pad_names(deployment: Deployment) -> list[tuple[str, str]]:

@@ -155,10 +155,12 @@ class StatusReporter:
         self._tick_us: dict[str, float] = {}
         self._logged_problems = dict.fromkeys(buses.ports, "")  # last problem of each bus, without digits
 
-    def record_tick(self, from_ns: int, to_ns: int) -> None:
-        """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`."""
+    def record_tick(self, from_ns: int, to_ns: int, due_periods: int = 1) -> None:
+        """Record a tick: last sample read at `from_ns`, messages sent at `to_ns`, due so many periods after
+        its SYNC."""
         self._tick_durations_ns.append(to_ns - from_ns)
-        self.stage_timer.record_tick(self._pipeline.cycle.sync_ns, self._sync.period_ns, from_ns, to_ns)
+        due_ns = due_periods * self._sync.period_ns
+        self.stage_timer.record_tick(self._pipeline.cycle.sync_ns, due_ns, from_ns, to_ns)
 
     def set_disabled(self, disabled_by: Mapping[int, str]) -> None:
         """Set the disabled pads and the names of the clients that disabled them; takes effect at once."""
@@ -186,9 +188,10 @@ class StatusReporter:
             self.supervisor.changed_pads.clear()
         if due := sorted(changed.union(self._pads_due(now_ns))):
             self._seq[due] += 1
-            columns = self._read_columns()
-            for pad in due:
-                self._publish(self._topics[pad], partial(self._make_health, pad, columns, now_ns))
+            if wanted := [pad for pad in due if self._is_wanted(self._topics[pad])]:
+                columns = self._read_columns()
+                for pad in wanted:
+                    self._publish(self._topics[pad], partial(self._make_health, pad, columns, now_ns))
         if now_ns - self._service_window.since_ns >= _SERVICE_PERIOD_NS:
             rates = self._service_window.per_second(now_ns, self._totals())
             self._rates_hz = dict(
@@ -312,6 +315,9 @@ class StatusReporter:
             )
             self._published_this_period = 0
         return due
+
+    def _is_wanted(self, topic: str) -> bool:
+        return self._on_message is not None or self._publisher.has_subscriber(topic)
 
     def _publish(self, topic: str, make: Callable[[], wire.Health | wire.Service]) -> None:
         """Make and send a message if its topic has a subscriber or `on_message` is set."""

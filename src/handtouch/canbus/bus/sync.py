@@ -122,6 +122,11 @@ class Sync:
         self._select_reference_bus()
 
     @property
+    def is_timed(self) -> bool:
+        """True while the loop's timer begins the cycles, not a received SYNC."""
+        return self._reference_bus is None
+
+    @property
     def wake_ns(self) -> int:
         """Latest time of the next `poll`."""
         return self._due_ns

@@ -185,6 +185,12 @@ class Master:
             self._run_timers(now_ns)
 
     @property
+    def is_booting(self) -> bool:
+        """True while a node is being identified or configured, in requests that wait for its responses."""
+        booting = (self.states >= NodeState.BOOTING) & (self.states <= NodeState.CONFIGURING)
+        return bool(np.count_nonzero(booting))
+
+    @property
     def wake_ns(self) -> int:
         """Latest time of the next `poll` that a timeout, retry or guarding request needs."""
         return self._next_due_ns
