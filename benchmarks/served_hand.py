@@ -3,9 +3,9 @@
 Nodes, daemon and subscribers are processes on a udp_multicast bus over loopback (in a network namespace of
 their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`.
 
-Public names: `in_own_network`, `on_loopback`, `open_bus`; `film`, `nodes`, `serving`, `daemon_process`,
-`bystanders`; `receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`; `ProcessorShare`, `processor_s`,
-`resident_mb`, `descriptors`; `asked_of`, `in_turns`.
+Public names: `in_own_network`, `on_loopback`, `open_bus`, `SpacedBus`; `film`, `nodes`, `serving`,
+`daemon_process`, `bystanders`; `receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`;
+`ProcessorShare`, `processor_s`, `resident_mb`, `descriptors`; `asked_of`, `in_turns`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from benchmarks.page import Rows, options, progress
 from handtouch import wire
+from handtouch.canbus.bus.load import frame_bits
 from handtouch.config import Deployment, load, shipped
 from handtouch.device import DeviceBus
 from handtouch.simulate.scenario import Scenario
@@ -45,6 +46,8 @@ SETTLED_S = 6.0
 PATHS = {"resting": "[[0.4, 0.4]]", "sliding": "[[0.3, 0.3], [0.7, 0.4], [0.3, 0.5], [0.7, 0.6], [0.4, 0.7]]"}
 """Path of the contacts, passed within ROUND_S in both directions"""
 MOST = 400_000
+MIN_SLEEP_S = 80e-6
+"""Shorter sleeps end too late by more than that"""
 FLOOR_ID = b"hand/floor"
 JOINING_S = 1.0
 
@@ -61,6 +64,22 @@ class StampedBus:
             self._stamps[1 + count % (len(self._stamps) - 1)] = time.monotonic_ns()
             self._stamps[0] = count + 1
         self._bus.send(message, timeout)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bus, name)
+
+
+class SpacedBus:
+    """A bus that sends a frame no sooner after the one before than that takes at a bit rate."""
+
+    def __init__(self, bus: can.BusABC, bitrate_bit_s: int) -> None:
+        self._bus, self._bitrate_bit_s, self._free_s = bus, bitrate_bit_s, 0.0
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        while (left_s := self._free_s - time.monotonic()) > 0:
+            time.sleep(left_s if left_s > MIN_SLEEP_S else 0.0)
+        self._bus.send(message, timeout)
+        self._free_s = time.monotonic() + frame_bits(len(message.data)) / self._bitrate_bit_s
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._bus, name)
