@@ -118,7 +118,7 @@ def served(
 
     `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
     `perceive` requests percepts, all or some kinds; `done` is the grasp if it has been simulated already;
-    `used_before`: the sheets are known to be rested, by a stored state.
+    `used_before`: the sheets are known to be rested, and all zeros known, by a stored state.
     """
     deployment = world.describe(deployment)
     if used_before:
@@ -138,6 +138,8 @@ def served(
         run = _Run(deployment, context, grasp, world, perceive)
         for pad in range(len(hand.pads) if used_before else 0):
             run.pipeline.tick.sheet_force.set_back_force(pad, 0.0, 0.0)
+            run.pipeline.tick.second.set_offset(pad, 0.0)
+            run.pipeline.tick.set_baseline(pad, 0.0)
         for tick, step in enumerate(steps.tolist()):
             run.tick(step, [of[tick] for of in counts])
         run.inputs.close()
