@@ -14,7 +14,7 @@ of the shares for the same seeds to the true pose and to all that handtouch publ
 it lies somewhere (dropped); its head points to the hole (wrong end); it is held beside the hole; it is in the
 hole by less than 5 mm (not deep enough). *Believed*: failures that the program takes for a success.
 
-Episodes are kept in docs/benchmarks/stress_bolt.jsonl with their commit and a digest of program and scene, and
+Episodes are kept in docs/benchmarks/stress_bolt.jsonl with their commit and a digest of program and scene;
 a run that was broken off goes on, with two processes. All cases grow side by side. Quick: one episode.
 """
 
