@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import math
+import os
 import re
 import signal
 import socket
@@ -33,7 +33,7 @@ def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
     (total,) = re.findall(row, done.stdout, re.MULTILINE)
     samples, pad_error_mm, bound_mm, worst_mm, false_positives = map(float, total)
     assert samples > 20
-    # without the weakest sample, which may lie anywhere on its pad, as its interval says; others are weak, too
+    # without the weakest sample, which may lie anywhere on its pad, as its interval says
     rest_mm = math.sqrt(max(samples * pad_error_mm**2 - worst_mm**2, 0) / samples)
     assert rest_mm < 2.5 * bound_mm + 0.01
     assert false_positives == 0
