@@ -113,8 +113,10 @@ class Nodes:
         self.seen: list[tuple[int, float]] = []
         self._noise = np.random.default_rng(4)
         self._buses = [open_bus(), open_bus()]
-        sends: Any = SpacedBus(self._buses[0], deployment.buses[0].bitrate_bit_s)
-        self._bus = DeviceBus(sends if is_spaced else self._buses[0], self._sample)
+        bus: Any = self._buses[0]
+        if is_spaced:
+            bus = SpacedBus(bus, deployment.buses[0].bitrate_bit_s)
+        self._bus = DeviceBus(bus, self._sample)
         self._devices = [self._bus.add(pad.node_id, serial=pad.serial) for pad in self.pads]
         self._notifier = can.Notifier(self._buses[1], [self._record_frame])
 

@@ -52,11 +52,22 @@ FLOOR_ID = b"hand/floor"
 JOINING_S = 1.0
 
 
-class StampedBus:
+class SendingBus:
+    """A bus whose `send` a subclass replaces."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._bus, name)
+
+
+class StampedBus(SendingBus):
     """A bus that records the send time of the last frame of each reply to SYNC."""
 
     def __init__(self, bus: can.BusABC, last_id: int, stamps: Any) -> None:
-        self._bus, self._last_id, self._stamps = bus, last_id, stamps
+        super().__init__(bus)
+        self._last_id, self._stamps = last_id, stamps
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
         if message.arbitration_id == self._last_id:  # before, for it may be answered before `send` returns
@@ -65,24 +76,19 @@ class StampedBus:
             self._stamps[0] = count + 1
         self._bus.send(message, timeout)
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._bus, name)
 
-
-class SpacedBus:
+class SpacedBus(SendingBus):
     """A bus that sends a frame no sooner after the one before than that takes at a bit rate."""
 
     def __init__(self, bus: can.BusABC, bitrate_bit_s: int) -> None:
-        self._bus, self._bitrate_bit_s, self._free_s = bus, bitrate_bit_s, 0.0
+        super().__init__(bus)
+        self._bitrate_bit_s, self._free_s = bitrate_bit_s, 0.0
 
     def send(self, message: can.Message, timeout: float | None = None) -> None:
         while (left_s := self._free_s - time.monotonic()) > 0:
             time.sleep(left_s if left_s > MIN_SLEEP_S else 0.0)
         self._bus.send(message, timeout)
         self._free_s = time.monotonic() + frame_bits(len(message.data)) / self._bitrate_bit_s
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._bus, name)
 
 
 def open_bus() -> can.BusABC:

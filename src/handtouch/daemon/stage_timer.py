@@ -76,7 +76,7 @@ class StageTimer:
         self._unreported_late: dict[str, tuple[int, int]] = {}
         self._spent_ns = [0] * len(_PARTS)
         self._previous_spent_ns = self._spent_ns
-        self._of_stages = list(self.histograms.values())
+        self._adders = [histogram.add for histogram in self.histograms.values()]
         self._last_ns = now_ns
         self._skipped_periods = 0
         self._is_late = False
@@ -121,9 +121,8 @@ class StageTimer:
     def begin_period(self, skipped: int, unticked: bool) -> None:
         """End a period at a SYNC. `skipped`: periods without SYNC so far; `unticked`: no tick in this one."""
         spent = self._spent_ns
-        for histogram, duration_ns in zip(self._of_stages, spent, strict=False):
-            histogram.counts[(duration_ns // FIRST_BUCKET_NS).bit_length()] += 1  # as `add`, without its call
-            histogram.sum_ns += duration_ns
+        for add, duration_ns in zip(self._adders, spent, strict=False):
+            add(duration_ns)
         late = max(skipped - self._skipped_periods, 1 if unticked or self._is_late else 0)
         if late:
             self._attribute_late_ticks(late)

@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, fields, replace
-from functools import partial
+from functools import cache, partial
 from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
@@ -188,10 +188,13 @@ class StatusReporter:
             self.supervisor.changed_pads.clear()
         if due := sorted(changed.union(self._pads_due(now_ns))):
             self._seq[due] += 1
-            if wanted := [pad for pad in due if self._is_wanted(self._topics[pad])]:
-                columns = self._read_columns()
-                for pad in wanted:
-                    self._publish(self._topics[pad], partial(self._make_health, pad, columns, now_ns))
+            columns = cache(self._read_columns)  # read once, and only for a message that is made
+
+            def make(pad: int) -> wire.Health:
+                return self._make_health(pad, columns(), now_ns)
+
+            for pad in due:
+                self._publish(self._topics[pad], partial(make, pad))
         if now_ns - self._service_window.since_ns >= _SERVICE_PERIOD_NS:
             rates = self._service_window.per_second(now_ns, self._totals())
             self._rates_hz = dict(
@@ -315,9 +318,6 @@ class StatusReporter:
             )
             self._published_this_period = 0
         return due
-
-    def _is_wanted(self, topic: str) -> bool:
-        return self._on_message is not None or self._publisher.has_subscriber(topic)
 
     def _publish(self, topic: str, make: Callable[[], wire.Health | wire.Service]) -> None:
         """Make and send a message if its topic has a subscriber or `on_message` is set."""
