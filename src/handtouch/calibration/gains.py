@@ -242,18 +242,18 @@ class GainEstimator:
         with_parts_as_stated = basis @ _inverse(self._information[:free, :free]) @ basis.T * widening
         status, reason = self._assess(float(np.sqrt(np.diag(with_parts_as_stated).max())))
         return GainEstimate(
-            np.exp(log_gains),
-            joint[: self._channels, : self._channels],
-            part_offsets,
-            joint,
-            part_widening,
-            math.sqrt(self._touch_variance),
-            self._contacts,
-            self._effective_contacts,
-            1 - self._mixture.outlier_fraction,
-            misfit,
-            status,
-            reason,
+            gains=np.exp(log_gains),
+            covariance=joint[: self._channels, : self._channels],
+            part_offsets=part_offsets,
+            joint_covariance=joint,
+            widening=part_widening,
+            touch_error=math.sqrt(self._touch_variance),
+            contacts=self._contacts,
+            effective_contacts=self._effective_contacts,
+            point_fraction=1 - self._mixture.outlier_fraction,
+            misfit=misfit,
+            status=status,
+            reason=reason,
         )
 
     @property

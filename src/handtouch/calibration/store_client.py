@@ -85,9 +85,16 @@ class StoreClient:
         return max(here, key=lambda version: version.written_utc).serial if here else None
 
     def store_parts(
-        self, serial: int, mounting_point: MountingPoint, provenance: Provenance, now: datetime,
-        *, gains: Gains | None = None, offsets: Offsets | None = None, sheet: StoredSheetState | None = None,
-    ) -> CalibrationVersion | None:  # fmt: skip
+        self,
+        serial: int,
+        mounting_point: MountingPoint,
+        provenance: Provenance,
+        now: datetime,
+        *,
+        gains: Gains | None = None,
+        offsets: Offsets | None = None,
+        sheet: StoredSheetState | None = None,
+    ) -> CalibrationVersion | None:
         """Store new parts of a calibration with the rest of the newest one; None if that fails."""
         before, _ = self.newest_applicable(serial, mounting_point, now)
         known = before.calibration if before else Calibration()

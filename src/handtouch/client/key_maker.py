@@ -66,7 +66,9 @@ def add_client(folder: Path, name: str, rights: str, file: Path) -> ClientKey:
         if path.exists():
             raise KeyFileError(f"{path} exists already; revoke that client first, or choose another name")
     public, secret = _new_key_pair()
-    made = ClientKey(name, public, secret, server.name, server.public_key)
+    made = ClientKey(
+        name=name, public_key=public, secret_key=secret, server=server.name, server_key=server.public_key
+    )
     try:
         _write_new_file(
             file,

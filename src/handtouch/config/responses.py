@@ -226,8 +226,9 @@ class Taxels(ForceLaw):
             ),
         )
         if not (array.fractions(*array.centres.T).max(axis=1) > _MIN_RESPONSE).all():
-            raise ValueError("positions_mm: a taxel hardly responds anywhere on the pad; x and y are from "
-                             "its centre")  # fmt: skip
+            raise ValueError(
+                "positions_mm: a taxel hardly responds anywhere on the pad; x and y are from its centre"
+            )
         return array
 
 

@@ -123,7 +123,11 @@ class Shear(Table):
         """Return the film's law in SI units."""
         side = self.plate_mm * _MM
         return FilmLaw(
-            1e6 / self.film_ohm_mm2, 1e3 * self.film_reference_kpa, self.film_alpha, side**2, side**2 / 12
+            siemens_per_m2=1e6 / self.film_ohm_mm2,
+            reference_pa=1e3 * self.film_reference_kpa,
+            alpha=self.film_alpha,
+            plate_m2=side**2,
+            gyration_m2=side**2 / 12,
         )
 
     def build_layer(self) -> ElasticLayer:

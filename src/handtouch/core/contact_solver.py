@@ -36,7 +36,6 @@ from handtouch.core.stages.two_sheets import TwoSheets
 FloatArray = NDArray[np.float64]
 _MODEL_ARRAYS = (
     "weight",
-    "gain_covariance",
     "peak_currents_a",
     "mounts",
     "crowding",
@@ -84,7 +83,13 @@ def make_solver(
         pad_tolerances=model.stage_tolerances(),
         laws=model.stage_laws(),
         surfaces=made_once(PadSurface, zip(model.surface_tables, strict=True)),
-        known=PartKnowledge(model.part_axes, model.part_axis_ends, model.part_offsets, model.touch_errors),
+        known=PartKnowledge(
+            axes=model.part_axes,
+            ends=model.part_axis_ends,
+            offsets=model.part_offsets,
+            touch_errors=model.touch_errors,
+            gain_covariance=model.gain_covariance,
+        ),
         arrays={name: _view(name, array) for name, array in arrays.items()},
         both=both,
     )

@@ -156,7 +156,15 @@ class DemandEvent:
         """Return the event that requests these outputs."""
         position, force, interval, palm, base = (tuple(column.tolist()) for column in requested[:5])
         motion = tuple(requested.motion.tolist())
-        return cls(position, force, interval, palm, base, motion, ticks_per_hand_frame)
+        return cls(
+            position=position,
+            force=force,
+            interval_ticks=interval,
+            palm=palm,
+            base=base,
+            motion=motion,
+            ticks_per_hand_frame=ticks_per_hand_frame,
+        )
 
     def apply(self, target: EventTarget) -> None:
         target.tick.set_requested(

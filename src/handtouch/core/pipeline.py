@@ -287,7 +287,9 @@ def run_tick(
     if tick.shear.any_configured:
         tick.shear.update_forces(slab)
     began, ended, updated, silent, _, framed = changes
-    return TickResult(cycle.sync_ns, began, updated, ended, silent, framed)
+    return TickResult(
+        sync_ns=cycle.sync_ns, began=began, updated=updated, ended=ended, silent=silent, framed=framed
+    )
 
 
 def detect_contacts(

@@ -66,14 +66,14 @@ def _merge_scenes(scenes: Sequence[_ResolvedScene]) -> SceneRequirements:
     requested = outputs.T @ pads  # of truth values: any scene with this output and this pad
     position, force, raw, palm, base, *percepts = requested
     return SceneRequirements(
-        np.asarray(pads.any(axis=0)),
-        position | palm | base,  # palm and base need the position on the link
-        force,
-        raw,
-        palm,
-        base,
-        np.where(pads, rate_hz, 0.0).max(axis=0),
-        np.array(percepts),
+        pads=np.asarray(pads.any(axis=0)),
+        position=position | palm | base,  # palm and base need the position on the link
+        force=force,
+        raw=raw,
+        palm=palm,
+        base=base,
+        rate_hz=np.where(pads, rate_hz, 0.0).max(axis=0),
+        percepts=np.array(percepts),
     )
 
 

@@ -257,9 +257,16 @@ class HandFrameEncoder:
             if name in self._sources or name in optional
         }
         frame = wire.HandFrame(
-            wire.SCHEMA_VERSION, self._session, some, 1 << 62, some, self._hand, self._links,
-            **columns, retained=False,
-        )  # fmt: skip
+            wire.SCHEMA_VERSION,
+            self._session,
+            some,
+            1 << 62,
+            some,
+            self._hand,
+            self._links,
+            **columns,
+            retained=False,
+        )
         payload = wire.to_map(frame)
         packer = msgpack.Packer()
         self._parts: list[bytes | memoryview] = []

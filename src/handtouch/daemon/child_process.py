@@ -193,9 +193,10 @@ class ChildProcess:
             cpus = ",".join(map(str, sorted(self._cpus)))
             command = [sys.executable, "-m", self._module, str(theirs.fileno()), cpus]
             environment = {
-                name: value for name, value in os.environ.items()
+                name: value
+                for name, value in os.environ.items()
                 if name not in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-            } | {"OPENBLAS_NUM_THREADS": "1"}  # fmt: skip
+            } | {"OPENBLAS_NUM_THREADS": "1"}
             try:
                 process = subprocess.Popen(
                     command, stdin=subprocess.PIPE, pass_fds=[theirs.fileno()], env=environment

@@ -300,8 +300,11 @@ class SupervisorClient:
         self.changed_pads.add(pad)
         _log.warning(
             "%s: node replaced (serial %s -> %s); quarantined until it is calibrated",
-            self._pad_name(pad), self._previous_serials[pad], self._serials[pad], extra=self._log_fields(pad),
-        )  # fmt: skip
+            self._pad_name(pad),
+            self._previous_serials[pad],
+            self._serials[pad],
+            extra=self._log_fields(pad),
+        )
 
     def _update_uncertainty(self, pad: int, quarantined: bool) -> None:
         self._set_calibration(pad, self._pipeline.calibrations[pad], quarantined)

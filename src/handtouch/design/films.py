@@ -39,4 +39,10 @@ def film_position_std(task: PadTask, lead_std_ohm: float = 0.0) -> FloatArray:
     covariance = np.einsum("pik,pjk->kij", parts, parts)
     covariance += np.eye(films.channels) * ((task.noise_a / total) ** 2)[:, None, None]
     no_bends = np.zeros((len(x), films.channels, 0))
-    return ContactResponse(fractions.T, np.moveaxis(slopes, 2, 0), no_bends, covariance, total).position_std
+    return ContactResponse(
+        fractions=fractions.T,
+        slopes=np.moveaxis(slopes, 2, 0),
+        bends=no_bends,
+        covariance=covariance,
+        total_a=total,
+    ).position_std

@@ -39,14 +39,14 @@ class PartTolerances:
     def from_tables(cls, pad: config.Pad, node: config.Node, sheet: config.Sheet) -> PartTolerances:
         """Return the tolerances that a deployment states."""
         return cls(
-            node.gain_std,
-            node.series_std,
-            1e-3 * sheet.gap_std_mm,
-            log_aspect_std(pad, sheet),
-            sheet.ohm_per_square_std,
-            sheet.contact_ohm_std,
-            sheet.alpha_std,
-            sheet.contact_radius_std_mm / sheet.contact_radius_mm,
+            gain=node.gain_std,
+            resistor=node.series_std,
+            gap_m=1e-3 * sheet.gap_std_mm,
+            log_aspect=log_aspect_std(pad, sheet),
+            sheet_ohm=sheet.ohm_per_square_std,
+            contact_ohm=sheet.contact_ohm_std,
+            alpha=sheet.alpha_std,
+            radius=sheet.contact_radius_std_mm / sheet.contact_radius_mm,
         )
 
 

@@ -77,7 +77,11 @@ def contact_response(
     covariance += np.eye(layout.count) * ((task.noise_a / total) ** 2)[:, None, None]
     bends = _bends(network, x, y, scales) if with_bends else np.zeros((layout.count, 0, len(x)))
     return ContactResponse(
-        fractions.T, np.moveaxis(slopes, 2, 0), np.moveaxis(bends, 2, 0), covariance, total
+        fractions=fractions.T,
+        slopes=np.moveaxis(slopes, 2, 0),
+        bends=np.moveaxis(bends, 2, 0),
+        covariance=covariance,
+        total_a=total,
     )
 
 

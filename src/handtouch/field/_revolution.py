@@ -107,7 +107,13 @@ class RevolutionSurface(SweptSurface):
     def _meridian(self, x: FloatArray) -> Meridian:
         axial, radius, cosine, sine = self._profile.curve(self._profile.at_conformal(x / self._mid_radius))
         _, mid_axial, mid_radius = self._mid_point
-        return Meridian(axial - mid_axial, radius - mid_radius, radius / mid_radius, cosine, sine)
+        return Meridian(
+            axial=axial - mid_axial,
+            radial=radius - mid_radius,
+            scale=radius / mid_radius,
+            cosine=cosine,
+            sine=sine,
+        )
 
 
 class SplineProfile:

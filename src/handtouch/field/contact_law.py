@@ -249,18 +249,26 @@ class ContactLaw:
         variance = (spread / radius) ** 2
         if self.hertz_n is None:
             offset = np.log(np.pi) + 2 * log_s + (log_k - 2 * log_s) / alpha
-            return _LogLawTerms(1 / alpha, 0.0, offset, log_s, variance, np.ones_like(alpha), 2 - 2 / alpha)
+            return _LogLawTerms(
+                power=1 / alpha,
+                growth=0.0,
+                offset=offset,
+                log_radius=log_s,
+                radius_variance=variance,
+                radius_weight=np.ones_like(alpha),
+                direct_weight=2 - 2 / alpha,
+            )
         growth = 1 / (2 + float(alpha.flat[0]))
         log_s = log_s - np.log(self.hertz_n) / 3  # radius = s force^(1/3)
         offset = 3 * growth * (log_k - (2 - 2 * alpha) * log_s + alpha * np.log(np.pi))
         return _LogLawTerms(
-            np.full_like(alpha, 3 * growth),
-            growth,
-            offset,
-            log_s + offset / 3,
-            variance,
-            3 * alpha * growth,
-            6 * (alpha - 1) * growth,
+            power=np.full_like(alpha, 3 * growth),
+            growth=growth,
+            offset=offset,
+            log_radius=log_s + offset / 3,
+            radius_variance=variance,
+            radius_weight=3 * alpha * growth,
+            direct_weight=6 * (alpha - 1) * growth,
         )
 
 

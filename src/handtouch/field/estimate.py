@@ -183,7 +183,14 @@ class LikelihoodFit:
         misfit = data - total * f
         mixing = (slopes * f).sum(1) / norm
         slopes = slopes - mixing[:, None] * f
-        return WhitenedModel(total, misfit, f, slopes, mixing, (misfit * misfit).sum(0))
+        return WhitenedModel(
+            total=total,
+            misfit=misfit,
+            fractions=f,
+            slopes=slopes,
+            mixing=mixing,
+            cost=(misfit * misfit).sum(0),
+        )
 
     def gauss_newton_step(self, at: WhitenedModel, point: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the Gauss-Newton step (2, n) and squared decrement (n,); coordinates at an edge are
@@ -303,7 +310,15 @@ class LikelihoodFit:
         units = np.stack([*np.broadcast_to(self.sides, point.shape), unit], axis=1) * self.noise_unit[:, None]
         covariance = np.where(covariance == 0, 0.0, covariance * units[:, :, None] * units[:, None, :])
         chi_squared = np.where(at.cost == 0, 0.0, (np.sqrt(at.cost) / self.noise_unit) ** 2)
-        return PointEstimate(x, y, at.total * unit, residual, chi_squared, covariance, converged)
+        return PointEstimate(
+            x=x,
+            y=y,
+            total=at.total * unit,
+            residual=residual,
+            chi_squared=chi_squared,
+            covariance=covariance,
+            converged=converged,
+        )
 
 
 def most_likely_direction(

@@ -265,13 +265,13 @@ def _map_to_rectangle(surface: Triangulation, corners: IntArray, known: int) -> 
     along += [2 * a + b - places[sides[2], 0], 2 * (a + b) - places[sides[3], 1]]
     boundary = np.concatenate([*(side[:-1] for side in along[:3]), along[3]])
     return _Rectangle(
-        a,
-        b,
-        places[:known],
-        surface.points[:known],
-        lengths,
-        np.maximum.accumulate(boundary),
-        lengths[begins],
+        a=a,
+        b=b,
+        places=places[:known],
+        points=surface.points[:known],
+        ring_m=lengths,
+        ring=np.maximum.accumulate(boundary),
+        corners_m=lengths[begins],
     )
 
 

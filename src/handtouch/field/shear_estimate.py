@@ -99,12 +99,12 @@ class ShearPad:
         covariance = gain @ weight @ gain.swapaxes(1, 2)
         conductance = np.exp(level) / self.drive_v
         return ShearEstimate(
-            motion.reshape(unknowns, *shape),
-            covariance[:, 1:, 1:].reshape(*shape, unknowns, unknowns),
-            conductance.reshape(shape),
-            (conductance * np.sqrt(covariance[:, 0, 0])).reshape(shape),
-            misfit.reshape(shape),
-            count - unknowns - 1,
+            motion=motion.reshape(unknowns, *shape),
+            covariance=covariance[:, 1:, 1:].reshape(*shape, unknowns, unknowns),
+            conductance_s_per_m2=conductance.reshape(shape),
+            conductance_std=(conductance * np.sqrt(covariance[:, 0, 0])).reshape(shape),
+            chi_squared=misfit.reshape(shape),
+            degrees=count - unknowns - 1,
         )
 
     def _fit(

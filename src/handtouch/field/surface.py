@@ -67,7 +67,7 @@ class _DevelopableSurface(SweptSurface):
 
     def _meridian(self, x: FloatArray) -> Meridian:
         zero, one = np.zeros_like(x), np.ones_like(x)
-        return Meridian(x - self._middle, zero, one, one, zero)
+        return Meridian(axial=x - self._middle, radial=zero, scale=one, cosine=one, sine=zero)
 
 
 @dataclass(frozen=True)
@@ -204,11 +204,11 @@ class ConeSurface(SweptSurface):
         cosine = math.sqrt((1 - self._slope) * (1 + self._slope))
         scale = 1 + from_centre * (self._slope / self._mid_radius)
         return Meridian(
-            cosine * from_centre,
-            self._slope * from_centre,
-            scale,
-            np.full_like(scale, cosine),
-            np.full_like(scale, self._slope),
+            axial=cosine * from_centre,
+            radial=self._slope * from_centre,
+            scale=scale,
+            cosine=np.full_like(scale, cosine),
+            sine=np.full_like(scale, self._slope),
         )
 
 
@@ -305,7 +305,11 @@ class SphereSurface(SweptSurface):
         cosine, sine = np.cos(latitude), np.sin(latitude)
         chord = 2 * self.radius_m * np.sin(half)
         return Meridian(
-            chord * np.cos(mean), -chord * np.sin(mean), cosine / math.cos(self._mid_latitude), cosine, -sine
+            axial=chord * np.cos(mean),
+            radial=-chord * np.sin(mean),
+            scale=cosine / math.cos(self._mid_latitude),
+            cosine=cosine,
+            sine=-sine,
         )
 
 

@@ -146,12 +146,12 @@ def sheet_law(
 ) -> ContactLaw:
     """Return a contact law in SI units, with the contact radius of the deployment's sheet."""
     return ContactLaw(
-        contact_ohm_mm2 * 1e-6,
-        alpha,
-        sheet.contact_radius_mm * 1e-3,
-        sheet.contact_radius_std_mm * 1e-3,
-        sheet.reference_kpa * 1e3,
-        hertz_force_n,
+        contact_ohm_m2=contact_ohm_mm2 * 1e-6,
+        alpha=alpha,
+        radius_m=sheet.contact_radius_mm * 1e-3,
+        radius_std_m=sheet.contact_radius_std_mm * 1e-3,
+        reference_pa=sheet.reference_kpa * 1e3,
+        hertz_n=hertz_force_n,
     )
 
 

@@ -218,8 +218,11 @@ class LinesReader(SourceReader):
         if math.log10(self.malformed).is_integer():
             _log.warning(
                 "%s: %d lines dropped; each must have a number for channels %s, and as many as others: %r",
-                self._url, self.malformed, ", ".join(self._channels), line[:80],
-            )  # fmt: skip
+                self._url,
+                self.malformed,
+                ", ".join(self._channels),
+                line[:80],
+            )
 
 
 def _read_queued(stream: _Stream) -> bytes:

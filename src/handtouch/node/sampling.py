@@ -73,13 +73,13 @@ class SampleTiming:
             return None
         times_s = 1e-9 * np.array(self._latencies_ns)
         return TimingSummary(
-            float(times_s.mean()),
-            float(times_s.std()),
-            float(times_s.min()),
-            float(times_s.max()),
-            max(self._spans_ns) * 1e-9,
-            len(times_s),
-            self._is_timed,
+            mean_s=float(times_s.mean()),
+            jitter_s=float(times_s.std()),
+            first_s=float(times_s.min()),
+            last_s=float(times_s.max()),
+            span_s=max(self._spans_ns) * 1e-9,
+            samples=len(times_s),
+            is_timed=self._is_timed,
         )
 
 

@@ -166,7 +166,14 @@ class FrictionMonitor:
         contact.slips = slips
         self._learn_sticking(contact, sticks=not (slips or contact.alarmed))
         label = "incipient" if contact.alarmed else "sticking"
-        return FrictionState(ratio, spread, contact.rate, 1 - ratio / self.limit.mean, probability, label)
+        return FrictionState(
+            ratio=ratio,
+            ratio_std=spread,
+            rate_per_s=contact.rate,
+            margin=1 - ratio / self.limit.mean,
+            probability=probability,
+            label=label,
+        )
 
     def _learn_sticking(self, contact: _Contact, *, sticks: bool) -> None:
         """Learn the least ratio of each span of `_STICK_S` in which a contact sticks."""

@@ -111,8 +111,12 @@ class MotionReporter:
             sure = slipping or slips > _MIN_SLIDING_PROBABILITY
             rolls = stays * (1 - slips) if slipping else 0.0
             found = (
-                stays * (1 - slips) - rolls, stays * slips * (not sure), stays * slips * sure, rolls, leaves,
-            )  # fmt: skip
+                stays * (1 - slips) - rolls,
+                stays * slips * (not sure),
+                stays * slips * sure,
+                rolls,
+                leaves,
+            )
             return dict(zip(MOTION_CLASSES, map(float, found), strict=True))
         slides = (1 - _ROLLING_PRIOR) if relative is None else relative.sliding_probability
         runs = stays * slips if slipping else 0.0
@@ -148,22 +152,22 @@ class MotionReporter:
             values |= relative.message_values()
         log_ratio = float(state.log_ratio)
         return PerceptEstimate(
-            "motion",
-            int(self._poses.hand_index[pad]),
-            pad,
-            int(self._slip.contact_id[pad]),
-            now_ns,
-            "undetermined" if few else "estimated",
-            label,
-            probabilities,
-            values,
-            {
+            kind="motion",
+            hand=int(self._poses.hand_index[pad]),
+            pad=pad,
+            contact=int(self._slip.contact_id[pad]),
+            estimate_ns=now_ns,
+            state="undetermined" if few else "estimated",
+            label=label,
+            probabilities=probabilities,
+            values=values,
+            evidence={
                 "samples": count,
                 "span_s": float(state.age_s),
                 "log_odds": log_ratio if math.isfinite(log_ratio) else 0.0,
                 "slips": int(state.slips),
             },
-            f"contact has just begun: at least {_MIN_SAMPLES} samples are needed" if few else "",
+            reason=f"contact has just begun: at least {_MIN_SAMPLES} samples are needed" if few else "",
         )
 
 

@@ -271,14 +271,14 @@ class _TrackedObject:
         placed = free_m[rows] @ now.rotation[rows].transpose(0, 2, 1) + now.origin_m[rows][:, None]
         point_std, normal_std = _conservative_stds(points)
         return PoseEvidence(
-            np.array([p.point_m for p in points]),
-            np.array([p.normal for p in points]),
-            np.array([p.spread_m for p in points]),
-            point_std,
-            normal_std,
-            np.array([p.edge_share for p in points]),
-            placed,
-            np.where(is_touched[rows], _TOUCHED_STD_M, _CLEAR_STD_M),
+            point_m=np.array([p.point_m for p in points]),
+            normal=np.array([p.normal for p in points]),
+            spread_m=np.array([p.spread_m for p in points]),
+            point_std_m=point_std,
+            normal_std_rad=normal_std,
+            edge_share=np.array([p.edge_share for p in points]),
+            free_m=placed,
+            free_std_m=np.where(is_touched[rows], _TOUCHED_STD_M, _CLEAR_STD_M),
         )
 
     def _is_another_place(self, evidence: PoseEvidence, touched: IntArray) -> bool:

@@ -349,15 +349,15 @@ class _PrimitiveProblem:
         beyond = math.exp(theta[-1]) if SIZE_PARAMETERS[self.name] else 0.0
         direction, point, names = self._direction_and_point(frame, theta)
         return PrimitiveFit(
-            log_evidence,
-            chi2,
-            3 * n - d,
-            direction,
-            middle + point,
-            self.prior.min_radius_m + beyond if SIZE_PARAMETERS[self.name] else 0.0,
-            beyond * math.sqrt(posterior[-1, -1]) if SIZE_PARAMETERS[self.name] else 0.0,
-            np.asarray(posterior, np.float64),
-            names,
+            log_evidence=log_evidence,
+            chi2=chi2,
+            degrees_of_freedom=3 * n - d,
+            direction=direction,
+            point=middle + point,
+            radius_m=self.prior.min_radius_m + beyond if SIZE_PARAMETERS[self.name] else 0.0,
+            radius_std_m=beyond * math.sqrt(posterior[-1, -1]) if SIZE_PARAMETERS[self.name] else 0.0,
+            covariance=np.asarray(posterior, np.float64),
+            parameter_names=names,
         )
 
     def _direction_and_point(

@@ -259,17 +259,17 @@ class ShapeEstimator(PerceptEstimator):
         evidence = {"samples": count}
         return [
             PerceptEstimate(
-                self.kind,
-                hand,
-                pad,
-                contact,
-                now_ns,
-                state,
-                label * determined,
-                probabilities,
-                values,
-                evidence,
-                reason,
+                kind=self.kind,
+                hand=hand,
+                pad=pad,
+                contact=contact,
+                estimate_ns=now_ns,
+                state=state,
+                label=label * determined,
+                probabilities=probabilities,
+                values=values,
+                evidence=evidence,
+                reason=reason,
             )
         ]
 
@@ -316,15 +316,15 @@ def _shape_percept(result: ShapeClassification, hand: int, now_ns: int, pads: in
         if SIZE_PARAMETERS[result.label]:
             values |= {"radius_m": found.radius_m, "radius_m_std": found.radius_std_m}
     return PerceptEstimate(
-        "shape",
-        hand,
-        -1,
-        0,
-        now_ns,
-        result.state,
-        result.label,
-        result.probabilities,
-        values,
-        {"contacts": result.contacts, "pads": pads},
-        result.reason,
+        kind="shape",
+        hand=hand,
+        pad=-1,
+        contact=0,
+        estimate_ns=now_ns,
+        state=result.state,
+        label=result.label,
+        probabilities=result.probabilities,
+        values=values,
+        evidence={"contacts": result.contacts, "pads": pads},
+        reason=result.reason,
     )

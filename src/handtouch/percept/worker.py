@@ -148,17 +148,17 @@ class PerceptWorker:
         )
         slips[_COLUMNS["row"].to_array(message.row)] = expit(odds)
         return HandSnapshot(
-            self._hands.index(message.hand),
-            int(rows[0]),
-            message.t_ns,
-            ids,
-            _COLUMNS["clear"].to_array(message.clear).astype(np.bool_),
-            slips,
-            poses[:, :9].reshape(-1, 3, 3),
-            poses[:, 9:],
-            base[:9].reshape(3, 3),
-            base[9:],
-            message.known_object,
+            hand=self._hands.index(message.hand),
+            first=int(rows[0]),
+            t_ns=message.t_ns,
+            contact_id=ids,
+            clear=_COLUMNS["clear"].to_array(message.clear).astype(np.bool_),
+            slip_probability=slips,
+            rotation=poses[:, :9].reshape(-1, 3, 3),
+            origin_m=poses[:, 9:],
+            base_rotation=base[:9].reshape(3, 3),
+            base_m=base[9:],
+            known_object=message.known_object,
         )
 
     def _positions_m(self, row: int, x: FloatArray, y: FloatArray) -> FloatArray:

@@ -109,7 +109,17 @@ class BankState:
         """Return the state of fresh sheets."""
         weight, back, exponent, variance, total, before = np.zeros((6, pads, BANK_MODELS))
         window, age_s, growth = np.zeros((pads, BANK_WINDOW)), np.zeros(pads), np.ones(pads)
-        return cls(weight, back, exponent, variance, total, before, window, age_s, growth)
+        return cls(
+            log_weight=weight,
+            back_n=back,
+            exponent=exponent,
+            exponent_variance=variance,
+            sum=total,
+            before=before,
+            window=window,
+            age_s=age_s,
+            growth=growth,
+        )
 
 
 class ModelBank:

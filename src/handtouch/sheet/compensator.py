@@ -42,7 +42,7 @@ class ParameterUncertainty:
     @classmethod
     def exact(cls) -> ParameterUncertainty:
         """Return the uncertainty of a known model, 0."""
-        return cls(0.0, 0.0, 0.0, math.inf, 0.0)
+        return cls(creep=0.0, adaptation=0.0, hysteresis=0.0, forget_time_s=math.inf, temperature_k=0.0)
 
 
 @dataclass(frozen=True)
@@ -78,17 +78,17 @@ class CompensatorState:
         plays = model.hysteresis.inverse.initial_state(pads)
         back_n, flow_total_s, back_std_n, press_n, flow_s, impulse_ns = np.zeros((6, pads))
         return cls(
-            model.creep.initial_state(pads),
-            plays,
-            back_n,
-            flow_total_s,
-            back_std_n,
-            press_n,
-            flow_s,
-            impulse_ns,
-            np.ones(pads, np.bool_),
-            np.zeros(1),
-            np.zeros(1, np.bool_),
+            elements=model.creep.initial_state(pads),
+            plays=plays,
+            back_n=back_n,
+            current_flow_s=flow_total_s,
+            back_std_n=back_std_n,
+            press_n=press_n,
+            flow_s=flow_s,
+            impulse_ns=impulse_ns,
+            powered=np.ones(pads, np.bool_),
+            waited_s=np.zeros(1),
+            load_is_old=np.zeros(1, np.bool_),
         )
 
 

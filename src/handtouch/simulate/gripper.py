@@ -129,11 +129,11 @@ class GripperWorld:
         position = self._position_m
         self._object.set_pull(self._pull_n(self._time_s))
         tips = FingertipPositions(
-            position["reach"],
-            position["lift"],
-            position["thumb"] - _HOME_OFFSET_M,
-            _HOME_OFFSET_M - position["index"],
-            self._tip_radius_m,
+            x_m=position["reach"],
+            z_m=position["lift"],
+            thumb_y_m=position["thumb"] - _HOME_OFFSET_M,
+            index_y_m=_HOME_OFFSET_M - position["index"],
+            index_radius_m=self._tip_radius_m,
         )
         self._contacts = self._object.advance(_TIME_STEP_S, tips)
 

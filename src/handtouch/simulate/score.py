@@ -254,26 +254,28 @@ def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
     length = np.linalg.norm(error, axis=1)
     has_samples = len(length) > 0
     return LinkScore(
-        name,
-        len(length),
-        _rms(length),
-        _rms(np.linalg.norm(np.concatenate([found.pad_error_m for found in matched]), axis=1)),
-        _rms(np.linalg.norm(np.concatenate([found.mount_error_m for found in matched]), axis=1)),
-        _rms(np.concatenate([found.bound_m for found in matched])),
-        float(np.median(length)) if has_samples else np.nan,
-        float(length.max()) if has_samples else np.nan,
-        _rms(np.linalg.norm(mean, axis=1)),
-        _rms(np.linalg.norm(error - mean, axis=1)),
-        _mean(np.concatenate([found.position_held for found in matched])),
-        _rms(np.concatenate([found.force_error_n for found in matched])),
-        _mean(np.concatenate([found.force_held for found in matched])),
-        _ratio(sum(len(found.position_held) for found in matched), len(length)),
-        _mean(np.concatenate([found.force_valid for found in matched])),
-        _mean(np.concatenate([found.force_bounded for found in matched])),
-        _mean(np.concatenate([found.bound_held for found in matched])),
-        sum(found.touches for found in matched),
-        sum(found.missed for found in matched),
-        sum(found.false_positives for found in matched),
+        name=name,
+        samples=len(length),
+        rms_error_m=_rms(length),
+        pad_error_m=_rms(np.linalg.norm(np.concatenate([found.pad_error_m for found in matched]), axis=1)),
+        mount_error_m=_rms(
+            np.linalg.norm(np.concatenate([found.mount_error_m for found in matched]), axis=1)
+        ),
+        rms_bound_m=_rms(np.concatenate([found.bound_m for found in matched])),
+        median_error_m=float(np.median(length)) if has_samples else np.nan,
+        max_error_m=float(length.max()) if has_samples else np.nan,
+        bias_m=_rms(np.linalg.norm(mean, axis=1)),
+        scatter_m=_rms(np.linalg.norm(error - mean, axis=1)),
+        position_coverage=_mean(np.concatenate([found.position_held for found in matched])),
+        rms_force_error_n=_rms(np.concatenate([found.force_error_n for found in matched])),
+        force_coverage=_mean(np.concatenate([found.force_held for found in matched])),
+        position_valid=_ratio(sum(len(found.position_held) for found in matched), len(length)),
+        force_valid=_mean(np.concatenate([found.force_valid for found in matched])),
+        force_bounded=_mean(np.concatenate([found.force_bounded for found in matched])),
+        bounds_held=_mean(np.concatenate([found.bound_held for found in matched])),
+        touches=sum(found.touches for found in matched),
+        missed=sum(found.missed for found in matched),
+        false_positives=sum(found.false_positives for found in matched),
     )
 
 

@@ -191,7 +191,14 @@ def _nodes_of(shape: SimulatedSurface, position: FloatArray, radius_m: FloatArra
     pressure = pressure / (area * pressure).sum(axis=1, keepdims=True)
     fractions = np.clip(shape.fractions_beside(position, vector_m), _EDGE, 1 - _EDGE)
     ratio = np.full((k, 1), (1 + shape.stretch) / 2)
-    return PatchNodes(fractions, form.stretch * vector_m, area, pressure, own_m, ratio)
+    return PatchNodes(
+        position=fractions,
+        place_m=form.stretch * vector_m,
+        area_m2=area,
+        pressure=pressure,
+        own_m=own_m,
+        radius_ratio=ratio,
+    )
 
 
 def _is_over_edge(middle: FloatArray, to_fractions: FloatArray, profile: _Profile) -> NDArray[np.bool_]:

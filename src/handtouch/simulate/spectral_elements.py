@@ -52,13 +52,13 @@ class ElementAxis:
         all_values[into], all_slopes[into] = values, slopes / half[:, None, None]
         nodes = (middle[:, None] + half[:, None] * reference[:-1]).ravel()
         return cls(
-            degree,
-            breaks,
-            np.append(nodes, length),
-            (middle[:, None] + half[:, None] * abscissae).ravel(),
-            np.outer(half, weights).ravel(),
-            all_values,
-            all_slopes,
+            degree=degree,
+            breaks=breaks,
+            nodes=np.append(nodes, length),
+            quadrature_points=(middle[:, None] + half[:, None] * abscissae).ravel(),
+            weights=np.outer(half, weights).ravel(),
+            values=all_values,
+            slopes=all_slopes,
         )
 
     def stiffness(self, weight: FloatArray) -> FloatArray:

@@ -435,15 +435,15 @@ def _true_circuit(
     film = FilmRatio.of_pad(pad, sheets[0], simulated_surface(pad.surface))
     unevenness = Unevenness(UNEVEN_MODES, hidden.unevenness, film)
     return PadCircuit(
-        shape,
-        gaps,
-        uneven_sheet_maps(shape, gaps, unevenness),
-        unevenness,
-        sheets[1],
-        np.array(hidden.series_ohm),
-        node.drive_v,
-        limit_a,
-        pad.state_numbers,
+        shape=shape,
+        gaps=gaps,
+        maps=uneven_sheet_maps(shape, gaps, unevenness),
+        unevenness=unevenness,
+        sheet=sheets[1],
+        series_ohm=np.array(hidden.series_ohm),
+        drive_v=node.drive_v,
+        limit_a=limit_a,
+        states=pad.state_numbers,
     )
 
 

@@ -208,9 +208,12 @@ class SupervisorWorker:
                 self._diagnostics.set_offsets(pad, np.zeros(row.channels))
             name = f"{row.mounting_point.hand}/{row.mounting_point.link}"
             _log.info(
-                "%s: node with serial %d: calibration %s%s", name, serial, row.calibrator.calibration_state,
+                "%s: node with serial %d: calibration %s%s",
+                name,
+                serial,
+                row.calibrator.calibration_state,
                 f", version {version.number} of {version.written_utc}" if version else "",
-            )  # fmt: skip
+            )
             if version is not None:
                 messages.append(self._restore_calibration(pad, version, now))
 

@@ -104,7 +104,15 @@ def _declaration(name: str, hint: Any, is_optional: bool, meanings: dict[str, st
         hint = str
     meaning = meanings.get(name, "")
     return FieldDeclaration(
-        name, hint, is_nilable or also_nilable, is_optional, meaning, column, values, codes, hand_column
+        name=name,
+        hint=hint,
+        is_nilable=is_nilable or also_nilable,
+        is_optional=is_optional,
+        meaning=meaning,
+        column=column,
+        values=values,
+        codes=codes,
+        hand_column=hand_column,
     )
 
 

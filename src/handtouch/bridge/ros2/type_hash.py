@@ -14,8 +14,14 @@ from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, byte, sequence
 
 _TYPE_IDS = {
-    "uint8": 3, "int32": 6, "uint32": 7, "uint64": 9, "float32": 10, "float64": 11, "byte": 16,
-}  # fmt: skip
+    "uint8": 3,
+    "int32": 6,
+    "uint32": 7,
+    "uint64": 9,
+    "float32": 10,
+    "float64": 11,
+    "byte": 16,
+}
 """Type identifiers of type_description_interfaces/msg/FieldType."""
 _NESTED_TYPE_ID, _BOOLEAN_TYPE_ID, _STRING_TYPE_ID = 1, 15, 17
 _ARRAY_OFFSET, _UNBOUNDED_SEQUENCE_OFFSET = 48, 144

@@ -13,11 +13,9 @@ cdef class Elongation:
                sine=double, prior=double, side=double, most=double, variance=double, first=double,
                other_variance=double, second=double, scale=double)
 cdef void estimate_elongation(
-    Elongation found, locate.ModelTable table, locate.Fit fit, tolerances.PadTolerances pad,
-    double metres2) noexcept
+    Elongation found, locate.ModelTable table, locate.Fit fit, double metres2) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, whitening=tolerances.Whitening)
-cdef void _read_derivatives(
-    Elongation found, locate.ModelTable table, locate.Fit fit, tolerances.PadTolerances pad) noexcept
+cdef void _read_derivatives(Elongation found, locate.ModelTable table, locate.Fit fit) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _project(Elongation found, locate.Fit fit, Py_ssize_t n, double determinant) noexcept
 cdef double _variance(double information, double prior) noexcept

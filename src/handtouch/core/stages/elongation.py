@@ -43,13 +43,7 @@ class Elongation:
         self.aa = self.ab = self.bb = self.a = self.b = 0.0
 
 
-def estimate_elongation(
-    found: Elongation,
-    table: locate.ModelTable,
-    fit: locate.Fit,
-    pad: tolerances.PadTolerances,
-    metres2: float,
-) -> None:
+def estimate_elongation(found: Elongation, table: locate.ModelTable, fit: locate.Fit, metres2: float) -> None:
     """Estimate the elongation of the contact in `fit`, just located.
 
     metres2: area on the surface of the rectangle's unit square there.
@@ -58,14 +52,14 @@ def estimate_elongation(
     determinant = fit.xx * fit.yy - fit.xy * fit.xy
     if not (table.is_potential and determinant > 1e-12 * fit.xx * fit.yy):
         return
-    _read_derivatives(found, table, fit, pad)
+    _read_derivatives(found, table, fit)
     _project(found, fit, table.electrodes, determinant)
     # the information about both numbers, in its principal axes; the prior that is in the whitening goes out
     half, middle = 0.5 * (found.aa - found.bb), 0.5 * (found.aa + found.bb)
     radius = math.sqrt(half * half + found.ab * found.ab)
     turn = 0.5 * math.atan2(found.ab, half)
     cosine, sine = math.cos(turn), math.sin(turn)
-    prior = tolerances.elongation_std(pad, fit.whitened_s)
+    prior = tolerances.elongation_std(fit.whitening.pad, fit.whitened_s)
     side = _MAX_STD_SIDES * min(table.side_x, table.side_y)
     most = side * side / _LINE
     variance = _variance(middle + radius, prior * prior)
@@ -84,18 +78,16 @@ def estimate_elongation(
     found.most_m *= scale
 
 
-def _read_derivatives(
-    found: Elongation, table: locate.ModelTable, fit: locate.Fit, pad: tolerances.PadTolerances
-) -> None:
+def _read_derivatives(found: Elongation, table: locate.ModelTable, fit: locate.Fit) -> None:
     """Whiten what a unit of both numbers adds to the currents: second derivatives by x x and x y."""
     n, whitening = table.electrodes, fit.whitening
-    if pad.is_shape_exact:
-        tolerances.read_second_derivatives(whitening, pad, fit.s, fit.t)
+    if whitening.pad.is_shape_exact:
+        tolerances.read_second_derivatives(whitening, fit.s, fit.t)
     for i in range(n):
-        fit.scaled[i] = tolerances.second_derivative(whitening, pad, i, 1.0, 0.0) * fit.total * fit.weight[i]
+        fit.scaled[i] = tolerances.second_derivative(whitening, i, 1.0, 0.0) * fit.total * fit.weight[i]
     tolerances.apply_whitening(whitening, fit.scaled, 0, found.along)
     for i in range(n):
-        fit.scaled[i] = tolerances.second_derivative(whitening, pad, i, 0.0, 1.0) * fit.total * fit.weight[i]
+        fit.scaled[i] = tolerances.second_derivative(whitening, i, 0.0, 1.0) * fit.total * fit.weight[i]
     tolerances.apply_whitening(whitening, fit.scaled, 0, found.across)
 
 

@@ -28,21 +28,13 @@ cdef class Fit:
     cdef public bint found
 
 @cython.locals(i=Py_ssize_t, tracked=bint, settled=bint, variance=double)
-cdef void locate(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known, Py_ssize_t number,
-    double[::1] gain_covariance, double s, double t) noexcept
+cdef void locate(ModelTable table, Fit fit, double s, double t) noexcept
 @cython.locals(_=Py_ssize_t, i=Py_ssize_t)
-cdef void locate_elongated(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
-    Py_ssize_t number, double moment_std) noexcept
+cdef void locate_elongated(ModelTable table, Fit fit, double moment_std) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
-cdef void _whiten(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
-    Py_ssize_t number) noexcept
+cdef void _whiten(ModelTable table, Fit fit) noexcept
 @cython.locals(_=Py_ssize_t)
-cdef void _refine(
-    ModelTable table, Fit fit, tolerances.PadTolerances pad, tolerances.PartKnowledge known,
-    Py_ssize_t number) noexcept
+cdef void _refine(ModelTable table, Fit fit) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _whiten_column(ModelTable table, Fit fit, Py_ssize_t first, double[::1] out) noexcept
 cdef void _read_model(ModelTable table, Fit fit) noexcept

@@ -82,7 +82,7 @@ class Fit:
     `gain` (points,): reduction of the cost by a contact at each search point.
     """
 
-    def __init__(self, channels: int, states: int) -> None:
+    def __init__(self, channels: int, states: int, known: tolerances.PartKnowledge) -> None:
         """Prepare for pads of at most so many electrodes, and states of a schedule."""
         n, columns = channels, channels + 1
         self.readings, self.data = view_memory(np.zeros(n)), view_memory(np.zeros(n))
@@ -91,7 +91,7 @@ class Fit:
         self.slope_x, self.slope_y = view_memory(np.zeros(n)), view_memory(np.zeros(n))
         self.raw, self.beside = view_memory(np.zeros(3 * columns)), view_memory(np.zeros(3 * columns))
         self.gain = view_memory(np.zeros(SEARCH_POINTS**2))
-        self.whitening = tolerances.Whitening(channels, states)
+        self.whitening = tolerances.Whitening(channels, states, known, self.weight)
         self.s = self.t = 0.0  # position, in cells
         self.read_s = self.read_t = _INFINITY  # the same of what was read from the table
         self.whitened_s = self.whitened_t = 0.0  # and for which tolerances were whitened
@@ -108,20 +108,11 @@ class Fit:
         self.found = False
 
 
-def locate(
-    table: ModelTable,
-    fit: Fit,
-    pad: tolerances.PadTolerances,
-    known: tolerances.PartKnowledge,
-    number: int,
-    gain_covariance: memoryview[float],
-    s: float,
-    t: float,
-) -> None:
+def locate(table: ModelTable, fit: Fit, s: float, t: float) -> None:
     """Find the most likely contact for the readings in `fit`; (s, t): last position in cells, NaN if new.
 
-    number: of the pad. gain_covariance: of log gains, (pads c c,), c channels a pad. `fit.found` is False
-    where no contact explains the currents better than none.
+    Noise and tolerances are those of `fit.whitening`, for whose pad the table is. `fit.found` is False where
+    no contact explains the currents better than none.
     """
     fit.sum = 0.0
     fit.read_s = fit.read_t = _INFINITY
@@ -130,20 +121,20 @@ def locate(
     tracked, settled = s == s and t == t, False
     if tracked:
         fit.s, fit.t = s, t
-        _whiten(table, fit, pad, known, number)
+        _whiten(table, fit)
         settled = _maximise(table, fit, True)
     if settled:
-        _refine(table, fit, pad, known, number)
+        _refine(table, fit)
         variance = max(fit.var_x / (table.side_x * table.side_x), fit.var_y / (table.side_y * table.side_y))
         settled = fit.cost <= _MAX_TRACKED_COST and variance <= _MAX_TRACKED_VARIANCE
     if not settled:
-        tolerances.whiten_by_gains(fit.whitening, gain_covariance, number, fit.readings)
+        tolerances.whiten_by_gains(fit.whitening, fit.readings)
         tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
         fit.whitened_s = fit.whitened_t = _INFINITY
         if not tracked:
             fit.s = fit.t = 0.5 * table.cells
         _search(table, fit, tracked)
-        _refine(table, fit, pad, known, number)
+        _refine(table, fit)
     fit.found = fit.total > 0.0
     if fit.found:
         _add_other_positions(table, fit)
@@ -154,14 +145,7 @@ def locate(
         _bound_by_pad(table, fit)
 
 
-def locate_elongated(
-    table: ModelTable,
-    fit: Fit,
-    pad: tolerances.PadTolerances,
-    known: tolerances.PartKnowledge,
-    number: int,
-    moment_std: float,
-) -> None:
+def locate_elongated(table: ModelTable, fit: Fit, moment_std: float) -> None:
     """Find again, from (s, t) and all over the pad, a contact that may be elongated.
 
     The result is `s`, `t`, `total` and `cost` alone. moment_std: see `whiten_elongated`.
@@ -172,46 +156,32 @@ def locate_elongated(
         fit.read_s = fit.read_t = _INFINITY
         _read_model(table, fit)
         total = max(fit.sum, 0.0) / channel_sum(table, fit)
-        tolerances.whiten_elongated(
-            fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t, moment_std, error_std
-        )
+        tolerances.whiten_elongated(fit.whitening, fit.raw, total, fit.s, fit.t, moment_std, error_std)
         for i in range(table.electrodes):
             fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
         tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.data)
         _search(table, fit, True)
 
 
-def _whiten(
-    table: ModelTable,
-    fit: Fit,
-    pad: tolerances.PadTolerances,
-    known: tolerances.PartKnowledge,
-    number: int,
-) -> None:
+def _whiten(table: ModelTable, fit: Fit) -> None:
     """Whiten for noise and tolerances at (s, t)."""
     n = table.electrodes
     _read_model(table, fit)
     total = max(fit.sum, 0.0) / channel_sum(table, fit)
-    tolerances.whiten(fit.whitening, pad, known, number, fit.raw, fit.weight, total, fit.s, fit.t)
+    tolerances.whiten(fit.whitening, fit.raw, total, fit.s, fit.t)
     for i in range(n):
         fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
     tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.data)
     fit.whitened_s, fit.whitened_t = fit.s, fit.t
 
 
-def _refine(
-    table: ModelTable,
-    fit: Fit,
-    pad: tolerances.PadTolerances,
-    known: tolerances.PartKnowledge,
-    number: int,
-) -> None:
+def _refine(table: ModelTable, fit: Fit) -> None:
     """Maximise again while the position is far from that of the tolerances; compute the covariance."""
     for _ in range(_MAX_WHITENINGS):
         away = max(abs(fit.s - fit.whitened_s), abs(fit.t - fit.whitened_t))
         if away <= _MAX_WHITENING_CELLS or not fit.total > 0.0:
             break
-        _whiten(table, fit, pad, known, number)
+        _whiten(table, fit)
         _maximise(table, fit, False)
     _compute_covariance(table, fit)
 

@@ -20,9 +20,7 @@ cdef class PairFit:
 
 @cython.locals(_=Py_ssize_t, k=Py_ssize_t, i=Py_ssize_t, explained=bint)
 cdef void fit_pair(
-    locate.ModelTable table, locate.Fit fit, PairFit pair, tolerances.PadTolerances pad,
-    tolerances.PartKnowledge known, Py_ssize_t number, double[::1] gain_covariance, double moment_std,
-    double limit) noexcept
+    locate.ModelTable table, locate.Fit fit, PairFit pair, double moment_std, double limit) noexcept
 @cython.locals(
     n=Py_ssize_t, side=Py_ssize_t, all_points=Py_ssize_t, points=Py_ssize_t, k=Py_ssize_t, at=Py_ssize_t,
     i=Py_ssize_t, j=Py_ssize_t, _=Py_ssize_t, first=Py_ssize_t, second=Py_ssize_t, near=bint)

@@ -63,10 +63,6 @@ def fit_pair(
     table: locate.ModelTable,
     fit: locate.Fit,
     pair: PairFit,
-    pad: tolerances.PadTolerances,
-    known: tolerances.PartKnowledge,
-    number: int,
-    gain_covariance: memoryview[float],
     moment_std: float,
     limit: float,
 ) -> None:
@@ -77,11 +73,11 @@ def fit_pair(
     the likelihood ratio, twice. `fit` is working memory.
     """
     pair.found = False
-    locate.locate_elongated(table, fit, pad, known, number, moment_std)
+    locate.locate_elongated(table, fit, moment_std)
     one = fit.cost if fit.total > 0.0 else _INFINITY
     if not one > limit:
         return
-    tolerances.whiten_by_gains(fit.whitening, gain_covariance, number, fit.readings)
+    tolerances.whiten_by_gains(fit.whitening, fit.readings)
     tolerances.apply_whitening(fit.whitening, fit.readings, 0, fit.data)
     _search(table, fit, pair)
     if not pair.cost < _INFINITY:
@@ -89,10 +85,7 @@ def fit_pair(
     for _ in range(_MAX_WHITENINGS):
         for k in range(4):
             pair.other[k] = pair.place[k]
-        tolerances.whiten_pair(
-            fit.whitening, pad, known, number, pair.fractions, fit.weight,
-            pair.total[0], pair.place[0], pair.place[1], pair.total[1], pair.place[2], pair.place[3],
-        )  # fmt: skip
+        tolerances.whiten_pair(fit.whitening, pair.fractions, pair.total, pair.place)
         for i in range(table.electrodes):
             fit.scaled[i] = fit.readings[i] - fit.whitening.shift[i]
         tolerances.apply_whitening(fit.whitening, fit.scaled, 0, fit.data)

@@ -86,8 +86,17 @@ FIELD_KINDS = "integer", "seconds", "name", "truth", "numbers", "covariance", "w
 covariance of the mount; as a whole number of it; as a text of the pad; as the two contacts of a pad."""
 _INTEGER, _SECONDS, _NAME, _TRUTH, _NUMBERS, _SUM, _WHOLE, _TEXT, _PARTS = range(len(FIELD_KINDS))
 CONDITIONS = (
-    "always", "located", "std", "frames", "palm", "base", "modelled", "vector", "part_palm", "part_base",
-)  # fmt: skip
+    "always",
+    "located",
+    "std",
+    "frames",
+    "palm",
+    "base",
+    "modelled",
+    "vector",
+    "part_palm",
+    "part_base",
+)
 """What a contact must have for a field of numbers not to be nil or absent: a position; the standard deviation
 of its force; requested frames; a position in the palm; in the base; a sheet with a model; a force vector; of
 one of two contacts, a position in the palm; in the base."""
@@ -95,15 +104,44 @@ _ALWAYS, _LOCATED, _STD, _FRAMES, _PALM, _BASE, _MODELLED, _VECTOR, _PART_PALM, 
     len(CONDITIONS)
 )
 INTEGERS = (
-    "seq", "t_ns", "event", "id", "begin_ns", "position_status", "force_status", "end_reason", "retained",
-    "group", "palm_status", "base_status", "fresh", "force_vector_status", "duration_s", "age_s",
+    "seq",
+    "t_ns",
+    "event",
+    "id",
+    "begin_ns",
+    "position_status",
+    "force_status",
+    "end_reason",
+    "retained",
+    "group",
+    "palm_status",
+    "base_status",
+    "fresh",
+    "force_vector_status",
+    "duration_s",
+    "age_s",
     "contact_radius_status",
-)  # fmt: skip
+)
 """Integers, truth values, numbers of names, and durations in nanoseconds."""
 (
-    _SEQ, _T, _EVENT, _ID, _BEGIN, _POSITION_STATUS, _FORCE_STATUS, _REASON, _RETAINED,
-    _GROUP, _PALM_STATUS, _BASE_STATUS, _FRESH, _VECTOR_STATUS, _DURATION, _AGE, _RADIUS_STATUS,
-) = range(len(INTEGERS))  # fmt: skip
+    _SEQ,
+    _T,
+    _EVENT,
+    _ID,
+    _BEGIN,
+    _POSITION_STATUS,
+    _FORCE_STATUS,
+    _REASON,
+    _RETAINED,
+    _GROUP,
+    _PALM_STATUS,
+    _BASE_STATUS,
+    _FRESH,
+    _VECTOR_STATUS,
+    _DURATION,
+    _AGE,
+    _RADIUS_STATUS,
+) = range(len(INTEGERS))
 _EVENTS: tuple[ContactEvent, ...] = typing.get_args(ContactEvent)
 _END_REASONS: tuple[EndReason, ...] = typing.get_args(EndReason)
 _NAMES: dict[str, tuple[str, ...]] = {
@@ -119,8 +157,14 @@ _NAMES: dict[str, tuple[str, ...]] = {
 """Texts of a field by its number"""
 _TRUTHS, _DURATIONS = ("retained", "fresh"), ("duration_s", "age_s")
 _PAD_TEXTS = (
-    "hand", "link", "frame", "begin_threshold_n", "end_threshold_n", "calibration_id", "diagnoses",
-)  # fmt: skip
+    "hand",
+    "link",
+    "frame",
+    "begin_threshold_n",
+    "end_threshold_n",
+    "calibration_id",
+    "diagnoses",
+)
 """Fields that change with a pad's calibration only"""
 _PLACES = {
     **{name: (name[:4], "palm_values", at) for name, at in slices_of(CONTACT_FRAMES).items()},

@@ -18,7 +18,6 @@ cdef class ContactSolver:
     cdef list models, pad_tolerances, laws, surfaces
     cdef force.StackTable stack
     cdef locate.Fit fit
-    cdef tolerances.PartKnowledge known
     cdef tables.Placement placement
     cdef readonly pairs.PairFit pair
     cdef double[::1] pair_limits, moment_stds
@@ -37,7 +36,7 @@ cdef class ContactSolver:
     cdef double centre_s, centre_t, log_spreading_m, gradient2, shift, moved2, scale2, slope_x, slope_y
     cdef double pure, mixed, straight_x, straight_y
     cdef bint were_two
-    cdef double[::1] currents, weight, gain_covariance, offset_std_a, covariance
+    cdef double[::1] currents, weight, offset_std_a, covariance
     cdef unsigned char[::1] force_requested, saturated, crowding
     cdef double[::1] peak_currents_a, ampere_per_count, noise_squared
     @cython.locals(k=Py_ssize_t)
@@ -115,8 +114,7 @@ cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept
                own=double, cornered=double, uneven=double, left_out=double, curved=double)
 cdef void _correct_crowding(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(fit=locate.Fit, n=Py_ssize_t, i=Py_ssize_t, change=double)
-cdef void _straighten(
-    ContactSolver solver, tolerances.PadTolerances parts, double inside, double scale2) noexcept
+cdef void _straighten(ContactSolver solver, double inside, double scale2) noexcept
 @cython.locals(i=Py_ssize_t, fit=locate.Fit, at=tables.Placement)
 cdef void _write_position(ContactSolver solver, Py_ssize_t pad) noexcept
 @cython.locals(at=tables.Placement, x=double, y=double, z=double, turning=double, even=double, xy=double,

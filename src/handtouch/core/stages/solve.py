@@ -120,9 +120,9 @@ class ContactSolver:
 
     arrays: memory by name, flat, with a row a pad; a pad reads of its c channels, as the pad with most
     electrodes has, as many as it has electrodes. currents, weight: (pads c,) currents [A] and 1 / noise
-    [1/A]. gain_covariance: (pads c c,) of log gains. offset_std_a: (pads,) of the sum of the currents, from
-    the baseline; it counts as noise of the channels, shared among them. force_requested: (pads,), 0 where no
-    force is to be estimated. values: (pads,) VALUE_ROWs, the result; NaN for a new contact, else the search
+    [1/A]. offset_std_a: (pads,) of the sum of the currents, from the baseline; it counts as noise of the
+    channels, shared among them. force_requested: (pads,), 0 where no force is to be estimated. values:
+    (pads,) VALUE_ROWs, the result; NaN for a new contact, else the search
     begins at the position in it. pair_limits: (pads,) squared misfit of one contact from which on two are
     tried, infinite where they can't be resolved; moment_stds: (pads,) [m^2], that of an elongated contact,
     see `tolerances.whiten_elongated`; parts: (2 pads,) PART_ROWs, of each pad two, NaN if there is one.
@@ -143,10 +143,10 @@ class ContactSolver:
         both: Any = None,
     ) -> None:
         self.models, self.pad_tolerances = models, pad_tolerances
-        self.laws, self.surfaces, self.known = laws, surfaces, known
+        self.laws, self.surfaces = laws, surfaces
         self.both, self.has_both = both, both is not None
         self.currents, self.weight, self.values = arrays["currents"], arrays["weight"], arrays["values"]
-        self.gain_covariance, self.offset_std_a = arrays["gain_covariance"], arrays["offset_std_a"]
+        self.offset_std_a = arrays["offset_std_a"]
         self.force_requested, self.saturated = arrays["force_requested"], arrays["saturated"]
         self.pair_limits, self.moment_stds = arrays["pair_limits"], arrays["moment_stds"]
         self.parts, self.misfits = arrays["parts"], arrays["misfits"]
@@ -154,7 +154,8 @@ class ContactSolver:
         self.crowding, self.noise_squared = arrays["crowding"], arrays["noise_squared"]
         self.ampere_per_count = arrays["ampere_per_count"]
         self.electrodes = n = len(self.currents) // len(models)
-        self.stack, self.fit = force.stack_table(), locate.Fit(n, max(pad.states for pad in pad_tolerances))
+        self.stack = force.stack_table()
+        self.fit = locate.Fit(n, max(pad.states for pad in pad_tolerances), known)
         self.placement, self.pair = tables.Placement(), pairs.PairFit(n)
         self.elongation, self.result = elongation.Elongation(n), force.ForceResult()
         self.part_law = force.empty_law()
@@ -181,7 +182,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
     """Locate a pad's contact, estimate its force, and place it in the link's frame."""
     fit, table, parts = solver.fit, solver.models[pad], solver.pad_tolerances[pad]
     n, first, saturated = table.electrodes, pad * solver.electrodes, 0
-    fit.whitening.electrodes = n
+    tolerances.choose_pad(fit.whitening, parts, pad, n)
     last_x, last_y = solver.values[pad].xy[0], solver.values[pad].xy[1]
     last_radius_m = solver.values[pad].contact_radius_m
     offset2 = solver.offset_std_a[pad] * solver.offset_std_a[pad] / n
@@ -199,16 +200,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
         _estimate_saturated(solver, pad)
     if solver.values[pad].cells[0] != solver.values[pad].cells[0]:  # a new contact
         _count_misfit(solver, pad)
-    locate.locate(
-        table,
-        fit,
-        parts,
-        solver.known,
-        pad,
-        solver.gain_covariance,
-        solver.values[pad].cells[0],
-        solver.values[pad].cells[1],
-    )
+    locate.locate(table, fit, solver.values[pad].cells[0], solver.values[pad].cells[1])
     solver.values[pad] = solver.no_value[0]
     solver.values[pad].is_bound = 1.0 if n - saturated < _UNKNOWNS else 0.0
     solver.were_two = _forget_parts(solver, pad, last_x != last_x)
@@ -243,9 +235,7 @@ def solve_contact(solver: ContactSolver, pad: int) -> None:
 def _write_elongation(solver: ContactSolver, pad: int) -> None:
     """Write length and direction of the contact just located and placed."""
     fit, found, at = solver.fit, solver.elongation, solver.placement
-    elongation.estimate_elongation(
-        found, solver.models[pad], fit, solver.pad_tolerances[pad], at.along_m * at.around_m
-    )
+    elongation.estimate_elongation(found, solver.models[pad], fit, at.along_m * at.around_m)
     solver.values[pad].length_m, solver.values[pad].min_length_m = found.length_m, found.least_m
     solver.values[pad].max_length_m = found.most_m
     along, around = math.cos(found.angle) / at.along_m, math.sin(found.angle) / at.around_m
@@ -430,17 +420,7 @@ def _resolve_pair(solver: ContactSolver, pad: int) -> None:
     """Write the two contacts of a pad, where the currents support two rather than one."""
     fit, pair, table = solver.fit, solver.pair, solver.models[pad]
     scale2 = solver.placement.scale_m * solver.placement.scale_m
-    pairs.fit_pair(
-        table,
-        fit,
-        pair,
-        solver.pad_tolerances[pad],
-        solver.known,
-        pad,
-        solver.gain_covariance,
-        solver.moment_stds[pad] / scale2,
-        solver.pair_limits[pad],
-    )
+    pairs.fit_pair(table, fit, pair, solver.moment_stds[pad] / scale2, solver.pair_limits[pad])
     if not pair.found:
         return
     solver.values[pad].length_m = solver.values[pad].min_length_m = solver.values[pad].max_length_m = _NAN
@@ -831,7 +811,7 @@ def _correct_crowding(solver: ContactSolver, pad: int) -> None:
         fit.var_x += curved * curved * at.slope_x * at.slope_x + left_out
         fit.var_y += curved * curved * at.slope_y * at.slope_y + left_out
     if inside < 1.0:
-        _straighten(solver, parts, inside, scale2)
+        _straighten(solver, inside, scale2)
         x += solver.straight_x
         y += solver.straight_y
         fit.var_x += _CUT_ERROR * _CUT_ERROR * solver.straight_x * solver.straight_x
@@ -842,7 +822,7 @@ def _correct_crowding(solver: ContactSolver, pad: int) -> None:
         tables.place_contact(solver.surfaces[pad], at, x, y)
 
 
-def _straighten(solver: ContactSolver, parts: tolerances.PadTolerances, inside: float, scale2: float) -> None:
+def _straighten(solver: ContactSolver, inside: float, scale2: float) -> None:
     """Find how far a position is off by the shape of a contact over the edge: a disc that an edge cuts
     spreads its current farther along it than across.
 
@@ -855,9 +835,9 @@ def _straighten(solver: ContactSolver, parts: tolerances.PadTolerances, inside: 
     along, across = solver.slope_x * solver.slope_x, solver.slope_y * solver.slope_y
     longer *= 0.5 / (along + across)
     by_xx, by_xy = longer * (along - across), longer * 2.0 * solver.slope_x * solver.slope_y
-    tolerances.read_second_derivatives(fit.whitening, parts, solver.centre_s, solver.centre_t)
+    tolerances.read_second_derivatives(fit.whitening, solver.centre_s, solver.centre_t)
     for i in range(n):
-        change = tolerances.second_derivative(fit.whitening, parts, i, by_xx, by_xy)
+        change = tolerances.second_derivative(fit.whitening, i, by_xx, by_xy)
         fit.data[i] = fit.weight[i] * change
     tolerances.apply_whitening(fit.whitening, fit.data, 0, fit.scaled)
     gradient_x = gradient_y = solver.straight_x = solver.straight_y = 0.0

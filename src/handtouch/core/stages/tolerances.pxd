@@ -17,54 +17,51 @@ cdef class PadTolerances:
     cdef bint has_series, is_elongated, is_shape_exact
 
 cdef class PartKnowledge:
-    cdef double[::1] axes, offsets, touch_errors
+    cdef double[::1] axes, offsets, touch_errors, gain_covariance
     cdef Py_ssize_t[::1] ends
     cdef Py_ssize_t size, rows, parts
 
 cdef class Whitening:
-    cdef double[::1] matrix, shift, modelled, fields, changes, vectors, vector
-    cdef Py_ssize_t electrodes, channels
+    cdef PadTolerances pad
+    cdef PartKnowledge known
+    cdef double[::1] weight, matrix, shift, modelled, fields, changes, vectors, vector
+    cdef Py_ssize_t number, electrodes, channels
 
 cpdef Py_ssize_t part_count(Py_ssize_t electrodes) noexcept
 
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, channels=Py_ssize_t, matrix='double[::1]')
-cdef void whiten_by_gains(
-    Whitening whitening, double[::1] gain_covariance, Py_ssize_t number, double[::1] readings) noexcept
-cdef void whiten(
-    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
-    double[::1] fractions, double[::1] weight, double total, double s, double t) noexcept
-@cython.locals(ratio=double, columns=Py_ssize_t)
-cdef void read_second_derivatives(Whitening whitening, PadTolerances pad, double s, double t) noexcept
-@cython.locals(first=Py_ssize_t, second=double)
-cdef double second_derivative(
-    Whitening whitening, PadTolerances pad, Py_ssize_t i, double by_xx, double by_xy) noexcept
+cdef void choose_pad(Whitening whitening, PadTolerances pad, Py_ssize_t number, Py_ssize_t electrodes) noexcept
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, channels=Py_ssize_t, first=Py_ssize_t, matrix='double[::1]')
+cdef void whiten_by_gains(Whitening whitening, double[::1] readings) noexcept
+cdef void whiten(Whitening whitening, double[::1] fractions, double total, double s, double t) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t)
 cdef void whiten_elongated(
-    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
-    double[::1] fractions, double[::1] weight, double total, double s, double t, double moment_std,
+    Whitening whitening, double[::1] fractions, double total, double s, double t, double moment_std,
     double error_std) noexcept
 cdef void whiten_pair(
-    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
-    double[::1] fractions, double[::1] weight, double total_1, double s_1, double t_1,
-    double total_2, double s_2, double t_2) noexcept
+    Whitening whitening, double[::1] fractions, double[::1] total, double[::1] place) noexcept
+cdef void _complete(Whitening whitening) noexcept
+@cython.locals(ratio=double, columns=Py_ssize_t, pad=PadTolerances)
+cdef void read_second_derivatives(Whitening whitening, double s, double t) noexcept
+@cython.locals(first=Py_ssize_t, second=double)
+cdef double second_derivative(Whitening whitening, Py_ssize_t i, double by_xx, double by_xy) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void _begin(Whitening whitening) noexcept
 @cython.locals(i=Py_ssize_t)
 cdef void _clear(double[::1] values, Py_ssize_t count) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, matrix='double[::1]')
+@cython.locals(n=Py_ssize_t, i=Py_ssize_t, pad=PadTolerances, matrix='double[::1]', weight='double[::1]')
 cdef void _add_contact(
-    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number,
-    double[::1] fractions, Py_ssize_t first, double[::1] weight, double total, double s, double t) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, state=Py_ssize_t, vector='double[::1]', by_state=double, std=double)
+    Whitening whitening, double[::1] fractions, Py_ssize_t first, double total, double s, double t) noexcept
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, state=Py_ssize_t, pad=PadTolerances, vector='double[::1]',
+    weight='double[::1]', by_state=double, std=double)
 cdef void _add_states(
-    Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
-    double total) noexcept
+    Whitening whitening, double[::1] fractions, Py_ssize_t first, double total) noexcept
 @cython.locals(
     n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t, k=Py_ssize_t, parts=Py_ssize_t, size=Py_ssize_t, varied=Py_ssize_t,
-    row=Py_ssize_t, count=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, vectors='double[::1]',
-    changes='double[::1]', axes='double[::1]', offsets='double[::1]')
-cdef void _add_parts(
-    Whitening whitening, PadTolerances pad, PartKnowledge known, Py_ssize_t number) noexcept
+    row=Py_ssize_t, count=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, number=Py_ssize_t, pad=PadTolerances,
+    known=PartKnowledge, vectors='double[::1]', changes='double[::1]', axes='double[::1]', offsets='double[::1]')
+cdef void _add_parts(Whitening whitening) noexcept
 @cython.locals(n=Py_ssize_t, i=Py_ssize_t, j=Py_ssize_t)
 cdef void apply_whitening(
     Whitening whitening, double[::1] values, Py_ssize_t first, double[::1] out) noexcept
@@ -73,17 +70,15 @@ cdef void transpose_whitening(
     Whitening whitening, double[::1] values, double[::1] weight, double[::1] out) noexcept
 @cython.locals(
     n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, resistor=Py_ssize_t, columns=Py_ssize_t, ends=Py_ssize_t,
-    field=Py_ssize_t, changes='double[::1]',
-    fields='double[::1]')
+    field=Py_ssize_t, pad=PadTolerances, changes='double[::1]', fields='double[::1]', weight='double[::1]')
 cdef void _add_changes(
-    Whitening whitening, PadTolerances pad, double[::1] fractions, Py_ssize_t first, double[::1] weight,
-    double total, double s, double t) noexcept
+    Whitening whitening, double[::1] fractions, Py_ssize_t first, double total, double s, double t) noexcept
 @cython.locals(cell=Py_ssize_t, beyond=double, std=double)
 cdef double elongation_std(PadTolerances pad, double s) noexcept
 cdef Py_ssize_t field_count(PadTolerances pad, Py_ssize_t n) noexcept
-@cython.locals(n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, vector='double[::1]', fields='double[::1]')
-cdef void _add_second_derivatives(
-    Whitening whitening, Py_ssize_t states, double[::1] weight, double total, double std) noexcept
+@cython.locals(
+    n=Py_ssize_t, i=Py_ssize_t, k=Py_ssize_t, first=Py_ssize_t, vector='double[::1]', fields='double[::1]')
+cdef void _add_second_derivatives(Whitening whitening, double total, double std) noexcept
 @cython.locals(k=Py_ssize_t, shift=double)
 cdef double overhang(PadTolerances pad, double distance_m) noexcept
 @cython.locals(i=Py_ssize_t, j=Py_ssize_t)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -118,7 +118,8 @@ class PartKnowledge:
     numbers of an upper triangle, row by row, whose product with its transpose is their covariance. ends:
     (pads rows,) number of columns of each row up to the last that isn't 0. offsets: (pads parts,) most likely
     values of the parts. `size`, `rows` and `parts` are those of the pad with most electrodes. touch_errors:
-    (pads,) standard deviation of the fractions of a touch, another one each time.
+    (pads,) standard deviation of the fractions of a touch, another one each time. gain_covariance:
+    (pads c c,) of the log gains alone, c channels a pad.
     """
 
     def __init__(
@@ -127,9 +128,11 @@ class PartKnowledge:
         ends: NDArray[np.intp],
         offsets: FloatArray,
         touch_errors: FloatArray,
+        gain_covariance: FloatArray,
     ) -> None:
         self.axes, self.ends = view_memory(axes), view_memory(ends)
         self.offsets, self.touch_errors = view_memory(offsets), view_memory(touch_errors)
+        self.gain_covariance = view_memory(gain_covariance)
         self.size, self.rows, self.parts = axes.shape[1], ends.shape[1], offsets.shape[1]
 
 
@@ -138,10 +141,13 @@ class Whitening:
     noise and tolerances vary is uncorrelated, of variance 1. `shift` (n,): what the offsets of the parts add
     to the currents over noise. `modelled` (n,): currents of the contacts over noise. `fields` (8 n
     and 2 n for each state,), `changes` (p n,), `vectors` (n (n + p),), `vector` (n,): working memory.
-    `electrodes` is n of the present pad, `channels` that of the pad with most; `states` that with most.
+    `electrodes` is n of the present pad, of which are `pad` and `number`, `channels` that of the pad with
+    most; `states` that with most. known: of all pads. weight: (n,) 1 / noise of the present pad.
     """
 
-    def __init__(self, channels: int, states: int) -> None:
+    def __init__(self, channels: int, states: int, known: PartKnowledge, weight: memoryview[float]) -> None:
+        self.known, self.weight, self.number = known, weight, 0
+        self.pad: Any = None
         n, parts = channels, part_count(channels)
         self.electrodes = self.channels = n
         self.matrix, self.shift = view_memory(np.zeros(n * n)), view_memory(np.zeros(n))
@@ -218,51 +224,39 @@ def part_count(electrodes: int) -> int:
     return 3 * electrodes + 2 + _WAVES
 
 
-def whiten_by_gains(
-    whitening: Whitening, gain_covariance: memoryview[float], number: int, readings: memoryview[float]
-) -> None:
+def choose_pad(whitening: Whitening, pad: PadTolerances, number: int, electrodes: int) -> None:
+    """Let what follows be of pad `number`."""
+    whitening.pad, whitening.number, whitening.electrodes = pad, number, electrodes
+
+
+def whiten_by_gains(whitening: Whitening, readings: memoryview[float]) -> None:
     """Set the whitening for a contact at an unknown position: that by gains alone, each by itself.
 
-    gain_covariance: of log gains, (pads c c,), c channels a pad. readings: (n,) currents over noise of pad
-    `number`.
+    readings: (n,) currents over noise.
     """
     n, matrix, channels = whitening.electrodes, whitening.matrix, whitening.channels
+    first = whitening.number * channels
     for i in range(n):
         whitening.shift[i] = 0.0
         for j in range(n):
             matrix[i * n + j] = 0.0
-        variance = gain_covariance[(number * channels + i) * channels + i] * readings[i] * readings[i]
+        variance = whitening.known.gain_covariance[(first + i) * channels + i] * readings[i] * readings[i]
         matrix[i * n + i] = 1.0 / math.sqrt(1.0 + variance)
 
 
-def whiten(
-    whitening: Whitening,
-    pad: PadTolerances,
-    known: PartKnowledge,
-    number: int,
-    fractions: memoryview[float],
-    weight: memoryview[float],
-    total: float,
-    s: float,
-    t: float,
-) -> None:
+def whiten(whitening: Whitening, fractions: memoryview[float], total: float, s: float, t: float) -> None:
     """Set whitening and shift for a contact at (s, t), in cells of the forward model, with a total current.
 
-    number: of the pad. fractions: (n,) there. weight: (n,) 1 / noise.
+    fractions: (n,) there.
     """
     _begin(whitening)
-    _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
-    _add_parts(whitening, pad, known, number)
-    _invert_root(whitening.matrix, whitening.electrodes)
+    _add_contact(whitening, fractions, 0, total, s, t)
+    _complete(whitening)
 
 
 def whiten_elongated(
     whitening: Whitening,
-    pad: PadTolerances,
-    known: PartKnowledge,
-    number: int,
     fractions: memoryview[float],
-    weight: memoryview[float],
     total: float,
     s: float,
     t: float,
@@ -277,49 +271,47 @@ def whiten_elongated(
     n = whitening.electrodes
     _begin(whitening)
     for i in range(n):
-        error = error_std * total * weight[i]
+        error = error_std * total * whitening.weight[i]
         whitening.matrix[i * n + i] += error * error
-    _add_contact(whitening, pad, known, number, fractions, 0, weight, total, s, t)
-    _add_parts(whitening, pad, known, number)
-    read_second_derivatives(whitening, pad, s, t)
-    _add_second_derivatives(whitening, pad.states, weight, total, moment_std)
+    _add_contact(whitening, fractions, 0, total, s, t)
+    _add_parts(whitening)
+    read_second_derivatives(whitening, s, t)
+    _add_second_derivatives(whitening, total, moment_std)
     _invert_root(whitening.matrix, n)
 
 
-def read_second_derivatives(whitening: Whitening, pad: PadTolerances, s: float, t: float) -> None:
-    """Read the fields of a pad at (s, t), in cells of the forward model, for `second_derivative`."""
+def whiten_pair(
+    whitening: Whitening, fractions: memoryview[float], total: memoryview[float], place: memoryview[float]
+) -> None:
+    """Set them for two contacts on one pad.
+
+    fractions: (2 n,) of the first, then of the second; total: (2,); place: (4,), s and t of each.
+    """
+    _begin(whitening)
+    _add_contact(whitening, fractions, 0, total[0], place[0], place[1])
+    _add_contact(whitening, fractions, whitening.electrodes, total[1], place[2], place[3])
+    _complete(whitening)
+
+
+def _complete(whitening: Whitening) -> None:
+    """Add what the contacts share, and invert."""
+    _add_parts(whitening)
+    _invert_root(whitening.matrix, whitening.electrodes)
+
+
+def read_second_derivatives(whitening: Whitening, s: float, t: float) -> None:
+    """Read the pad's fields at (s, t), in cells of the forward model, for `second_derivative`."""
+    pad = whitening.pad
     ratio, columns = pad.cell_ratio, field_count(pad, whitening.electrodes)
     tables.read_values(pad.values, pad.cells, columns, s * ratio, t * ratio, whitening.fields)
 
 
-def second_derivative(whitening: Whitening, pad: PadTolerances, i: int, by_xx: float, by_xy: float) -> float:
+def second_derivative(whitening: Whitening, i: int, by_xx: float, by_xy: float) -> float:
     """Return these multiples of the second derivatives of fraction i by x x and by x y, summed."""
-    first = (2 * pad.states + 1 + _WAVES) * whitening.electrodes
+    first = (2 * whitening.pad.states + 1 + _WAVES) * whitening.electrodes
     second: float = by_xx * whitening.fields[first + i]
     second += by_xy * whitening.fields[first + whitening.electrodes + i]
     return second
-
-
-def whiten_pair(
-    whitening: Whitening,
-    pad: PadTolerances,
-    known: PartKnowledge,
-    number: int,
-    fractions: memoryview[float],
-    weight: memoryview[float],
-    total_1: float,
-    s_1: float,
-    t_1: float,
-    total_2: float,
-    s_2: float,
-    t_2: float,
-) -> None:
-    """Set them for two contacts on one pad, `fractions` (2 n,) of the first, then of the second."""
-    _begin(whitening)
-    _add_contact(whitening, pad, known, number, fractions, 0, weight, total_1, s_1, t_1)
-    _add_contact(whitening, pad, known, number, fractions, whitening.electrodes, weight, total_2, s_2, t_2)
-    _add_parts(whitening, pad, known, number)
-    _invert_root(whitening.matrix, whitening.electrodes)
 
 
 def _begin(whitening: Whitening) -> None:
@@ -340,43 +332,28 @@ def _clear(values: memoryview[float], count: int) -> None:
 
 
 def _add_contact(
-    whitening: Whitening,
-    pad: PadTolerances,
-    known: PartKnowledge,
-    number: int,
-    fractions: memoryview[float],
-    first: int,
-    weight: memoryview[float],
-    total: float,
-    s: float,
-    t: float,
+    whitening: Whitening, fractions: memoryview[float], first: int, total: float, s: float, t: float
 ) -> None:
     """Add what is a contact's own: errors of its touch and shape, and its share of the changes by parts."""
-    n, matrix = whitening.electrodes, whitening.matrix
+    n, matrix, pad, weight = whitening.electrodes, whitening.matrix, whitening.pad, whitening.weight
     for i in range(n):
-        error = known.touch_errors[number] * total * weight[i]
+        error = whitening.known.touch_errors[whitening.number] * total * weight[i]
         matrix[i * n + i] += error * error
         whitening.modelled[i] += total * fractions[first + i] * weight[i]
     if pad.states > 1:
-        _add_states(whitening, pad, fractions, first, weight, total)
+        _add_states(whitening, fractions, first, total)
     if not pad.is_shape_exact:
-        _add_changes(whitening, pad, fractions, first, weight, total, s, t)
+        _add_changes(whitening, fractions, first, total, s, t)
     if pad.is_elongated:
         # current that spreads with variances v + d along one direction and v - d at right angles to it adds d
         # times the second derivative along it, as potentials are harmonic; the direction is unknown
-        _add_second_derivatives(whitening, pad.states, weight, total, elongation_std(pad, s))
+        _add_second_derivatives(whitening, total, elongation_std(pad, s))
 
 
-def _add_states(
-    whitening: Whitening,
-    pad: PadTolerances,
-    fractions: memoryview[float],
-    first: int,
-    weight: memoryview[float],
-    total: float,
-) -> None:
+def _add_states(whitening: Whitening, fractions: memoryview[float], first: int, total: float) -> None:
     """Add the covariance by currents of a contact that differ from state to state of a schedule."""
-    n, vector, by_state = whitening.electrodes, whitening.vector, pad.state_std_per_a * total
+    n, vector, pad, weight = whitening.electrodes, whitening.vector, whitening.pad, whitening.weight
+    by_state = pad.state_std_per_a * total
     std = math.sqrt(pad.state_std * pad.state_std + by_state * by_state)
     for state in range(pad.states):
         for i in range(n):
@@ -386,9 +363,10 @@ def _add_states(
         _add_square(whitening.matrix, vector, n)
 
 
-def _add_parts(whitening: Whitening, pad: PadTolerances, known: PartKnowledge, number: int) -> None:
+def _add_parts(whitening: Whitening) -> None:
     """Add the covariance by gains and parts, which all contacts share; set the shift."""
     n, vectors, changes = whitening.electrodes, whitening.vectors, whitening.changes
+    pad, known, number = whitening.pad, whitening.known, whitening.number
     parts = part_count(n)
     size, axes, offsets, varied = n + parts, known.axes, known.offsets, 0
     if not pad.is_shape_exact:
@@ -440,17 +418,11 @@ def transpose_whitening(
 
 
 def _add_changes(
-    whitening: Whitening,
-    pad: PadTolerances,
-    fractions: memoryview[float],
-    first: int,
-    weight: memoryview[float],
-    total: float,
-    s: float,
-    t: float,
+    whitening: Whitening, fractions: memoryview[float], first: int, total: float, s: float, t: float
 ) -> None:
     """Add the changes of the currents over noise by one standard deviation of each part."""
     n, changes, fields = whitening.electrodes, whitening.changes, whitening.fields
+    pad, weight = whitening.pad, whitening.weight
     ends, ratio = 2 * pad.states * n, pad.cell_ratio
     tables.read_values(pad.values, pad.cells, field_count(pad, n), s * ratio, t * ratio, fields)
     for i in range(n):
@@ -491,14 +463,13 @@ def field_count(pad: PadTolerances, n: int) -> int:
     return (2 * pad.states + 3 + _WAVES) * n
 
 
-def _add_second_derivatives(
-    whitening: Whitening, states: int, weight: memoryview[float], total: float, std: float
-) -> None:
+def _add_second_derivatives(whitening: Whitening, total: float, std: float) -> None:
     """Add the covariance by second derivatives, which are in `fields`, with amplitudes of deviation `std`."""
     n, vector, fields = whitening.electrodes, whitening.vector, whitening.fields
+    first = (2 * whitening.pad.states + 1 + _WAVES) * n
     for k in range(2):
         for i in range(n):
-            vector[i] = std * fields[(2 * states + 1 + _WAVES + k) * n + i] * total * weight[i]
+            vector[i] = std * fields[first + k * n + i] * total * whitening.weight[i]
         _add_square(whitening.matrix, vector, n)
 
 

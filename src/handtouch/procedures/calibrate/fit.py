@@ -198,18 +198,18 @@ class _ReadingColumns:
         current = np.array([reading.current_a for reading in readings])
         noise = np.array([reading.current_std_a for reading in readings]) / current
         return cls(
-            np.array([reading.apparent_n for reading in readings]),
-            np.log(current),
-            noise**2,
-            np.array([reading.weight.std_n / reading.weight.force_n for reading in readings]),
-            np.array([circuit.spreading_m for circuit in circuits]),
-            np.array([circuit.spreading_log_std for circuit in circuits]),
-            np.array([circuit.drive_v for circuit in circuits]),
-            np.array([circuit.series_ohm for circuit in circuits]),
-            radii,
-            indenter,
-            reference_pa,
-            radius_std,
+            force_n=np.array([reading.apparent_n for reading in readings]),
+            log_current=np.log(current),
+            variance=noise**2,
+            log_force_std=np.array([reading.weight.std_n / reading.weight.force_n for reading in readings]),
+            spreading_m=np.array([circuit.spreading_m for circuit in circuits]),
+            spreading_log_std=np.array([circuit.spreading_log_std for circuit in circuits]),
+            drive_v=np.array([circuit.drive_v for circuit in circuits]),
+            series_ohm=np.array([circuit.series_ohm for circuit in circuits]),
+            radii_m=radii,
+            indenter=indenter,
+            reference_pa=reference_pa,
+            radius_std=radius_std,
         )
 
     def log_current_model(
@@ -354,9 +354,19 @@ def _build_fit(
     remarks = _remarks(observed, share, half[2], quantile * solved.sheet_std, solved.scatter)
     radii = np.exp(theta[3:])
     return LawFit(
-        law, intervals, solved.scatter, misfit, solved.degrees_of_freedom, observed, radii, residual,
-        evidence, tuple(problems), tuple(remarks), _BandBasis(data, theta, solved.covariance, quantile),
-    )  # fmt: skip
+        law=law,
+        intervals=intervals,
+        scatter=solved.scatter,
+        misfit=misfit,
+        degrees_of_freedom=solved.degrees_of_freedom,
+        sheet_observed=observed,
+        radii_m=radii,
+        residuals=residual,
+        evidence=evidence,
+        problems=tuple(problems),
+        remarks=tuple(remarks),
+        basis=_BandBasis(data, theta, solved.covariance, quantile),
+    )
 
 
 @dataclass(frozen=True)
@@ -370,11 +380,17 @@ class _BandBasis:
         indenter = int(np.argmin(np.abs(self.data.radii_m - radius_m)))
         like = np.ones_like(force_n)
         at = replace(
-            self.data, force_n=force_n, log_current=like, variance=like, log_force_std=0 * like,
-            spreading_m=circuit.spreading_m * like, spreading_log_std=0 * like,
-            drive_v=circuit.drive_v * like, series_ohm=circuit.series_ohm * like,
+            self.data,
+            force_n=force_n,
+            log_current=like,
+            variance=like,
+            log_force_std=0 * like,
+            spreading_m=circuit.spreading_m * like,
+            spreading_log_std=0 * like,
+            drive_v=circuit.drive_v * like,
+            series_ohm=circuit.series_ohm * like,
             indenter=np.full(len(force_n), indenter, dtype=np.intp),
-        )  # fmt: skip
+        )
         values = at.log_current_model(
             np.vstack([self.theta, self.theta + np.eye(len(self.theta)) * _DIFFERENCE_STEP])
         )

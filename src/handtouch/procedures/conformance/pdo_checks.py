@@ -158,16 +158,16 @@ def _measure(
     delays_us.sort()
     late = sum(delay > window_us for delay in delays_us)
     return RateMeasurement(
-        period_ms,
-        len(cycles),
-        max(0, expected - received),
-        max(0, received - expected),
-        late + (len(cycles) - len(delays_us)),
-        round(statistics.median(delays_us), 1) if delays_us else None,
-        round(delays_us[math.ceil(0.99 * len(delays_us)) - 1], 1) if delays_us else None,
-        round(delays_us[-1], 1) if delays_us else None,
-        round(statistics.pstdev(delays_us), 1) if delays_us else None,
-        round(max(abs(gap - period_ms * MS) for gap in gaps) * 1e-3, 1),
+        period_ms=period_ms,
+        syncs=len(cycles),
+        missing=max(0, expected - received),
+        extra=max(0, received - expected),
+        late=late + (len(cycles) - len(delays_us)),
+        median_us=round(statistics.median(delays_us), 1) if delays_us else None,
+        p99_us=round(delays_us[math.ceil(0.99 * len(delays_us)) - 1], 1) if delays_us else None,
+        max_us=round(delays_us[-1], 1) if delays_us else None,
+        jitter_us=round(statistics.pstdev(delays_us), 1) if delays_us else None,
+        worst_sync_error_us=round(max(abs(gap - period_ms * MS) for gap in gaps) * 1e-3, 1),
     )
 
 

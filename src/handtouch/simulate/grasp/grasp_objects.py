@@ -91,15 +91,15 @@ GRASP_OBJECTS: Mapping[str, GraspObject] = MappingProxyType(
                 "pen", "cylinder", (0.006, 0.075), 0.02, (0.073, 0.0, 0.022), (90, 0, 0), (0, 1, 0), _HOOK_DEG
             ),
             GraspObject(
-                "cup",
-                "frustum",
-                (0.026, 0.032, 0.05),
-                0.10,
-                (0.066, 0.0, 0.048),
-                (90, 0, 0),
-                (0, 1, 0),
-                _FIST_DEG,
-                0.06,
+                name="cup",
+                kind="frustum",
+                size_m=(0.026, 0.032, 0.05),
+                mass_kg=0.10,
+                position_m=(0.066, 0.0, 0.048),
+                rpy_deg=(90, 0, 0),
+                pull_direction=(0, 1, 0),
+                closed_deg=_FIST_DEG,
+                max_torque_nm=0.06,
             ),
         )
     }

@@ -42,7 +42,9 @@ class Motor:
     joint_damping_nm_s: float
 
 
-_MOTOR = Motor(1.5, 0.03, np.inf, 1e-4, 0.005)
+_MOTOR = Motor(
+    stiffness_nm=1.5, damping_nm_s=0.03, max_torque_nm=np.inf, armature_kg_m2=1e-4, joint_damping_nm_s=0.005
+)
 """Of a grasp; the object states the torque"""
 
 

@@ -60,14 +60,16 @@ def contact_patches(grasp: GraspRecord) -> ContactPatches:
     discs = [pad_discs(grasp.pads[row], *points[1:]) for row, points in enumerate(sensed)]
     depth = max((int(np.bincount(steps).max()) for steps, *_ in discs if len(steps)), default=1)
     patches = ContactPatches(
-        np.full((n, p, depth, 2), 0.5),
-        np.zeros((n, p, depth)),
-        np.full((n, p, depth), _MIN_RADIUS_M),
-        np.full((n, p, 2), np.nan),
-        np.zeros((n, p)),
-        np.zeros((n, p)),
-        len(grasp.step_index) - sum(len(points) for points, *_ in sensed),
-        _force_fraction_off_pad(grasp, np.concatenate([points for points, *_ in sensed])),
+        position=np.full((n, p, depth, 2), 0.5),
+        force_n=np.zeros((n, p, depth)),
+        radius_m=np.full((n, p, depth), _MIN_RADIUS_M),
+        force_centre=np.full((n, p, 2), np.nan),
+        total_n=np.zeros((n, p)),
+        effective_radius_m=np.zeros((n, p)),
+        points_off_pad=len(grasp.step_index) - sum(len(points) for points, *_ in sensed),
+        force_fraction_off_pad=_force_fraction_off_pad(
+            grasp, np.concatenate([points for points, *_ in sensed])
+        ),
     )
     for row, (steps, position, force, radius) in enumerate(discs):
         lane = np.arange(len(steps)) - np.searchsorted(steps, steps)  # steps are in order

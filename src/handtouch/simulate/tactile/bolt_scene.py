@@ -38,7 +38,9 @@ _TABLE_FRICTION, _HAND_FRICTION, _PLATE_FRICTION = 0.6, 0.9, 0.2
 _STIFF = (2e-3, 1.0)  # time constant [s] and damping ratio of metal on metal
 _STIFF_IMPEDANCE = (0.98, 0.999, 1e-4, 0.5, 2.0)
 _ARM = (4e-3, 1.0)
-_MOTOR = Motor(3.0, 0.06, 0.6, 2e-4, 0.01)
+_MOTOR = Motor(
+    stiffness_nm=3.0, damping_nm_s=0.06, max_torque_nm=0.6, armature_kg_m2=2e-4, joint_damping_nm_s=0.01
+)
 _AREA_M = 0.02
 """The bolt's middle lies within this distance of the origin, along x and y."""
 

@@ -129,9 +129,14 @@ class LooseElectrodeDetector:
             del self._candidates[key]
 
     def _find_steps(
-        self, stamps: NDArray[np.int64], closed: FloatArray, opened_counts: FloatArray,
-        usable: NDArray[np.bool_], *, opened: bool,
-    ) -> None:  # fmt: skip
+        self,
+        stamps: NDArray[np.int64],
+        closed: FloatArray,
+        opened_counts: FloatArray,
+        usable: NDArray[np.bool_],
+        *,
+        opened: bool,
+    ) -> None:
         """Record the pairs of samples (k, n, c) that differ by one open electrode."""
         total, left = closed.sum(axis=2), opened_counts.sum(axis=2)
         usable = usable & (left > _MIN_SCALE * total) & (left < _MAX_SCALE * total)
