@@ -236,3 +236,17 @@ def test_the_force_of_a_contact_near_an_edge_is_that_which_the_simulator_presses
         assert abs(found_n - pressed_n) < limit * pressed_n
         assert abs(found_n - pressed_n) < 2.0 * std_n
         assert std_n < 0.02 * pressed_n
+
+
+def test_forces_of_firm_contacts_of_exact_parts_are_within_their_intervals() -> None:
+    """Near the greatest current of a sheet, a small error of the theory is a large one of the force."""
+    stated, hand = plane_under_the_simulator()
+    rng, count = np.random.default_rng(1), 60
+    place, force_n = rng.uniform(0.1, 0.9, (2, count)), rng.uniform(5.0, 20.0, count)
+    currents_a = hand.solve_contacts(
+        np.zeros(count, np.intp), place, discs(np.full(count, 1e-3 * RADIUS_MM)), force_n
+    )
+    found_n, std_n = np.array([force_n_of(own_a, stated) for own_a in currents_a]).T
+    sigmas = np.abs(found_n - force_n) / std_n
+    assert np.mean(sigmas < 1.96) > 0.9
+    assert sigmas.max() < 5.0
