@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from handtouch.field.model import FloatArray
+from handtouch.arrays import FloatArray
 from handtouch.field.rectangle import Rectangle
 
 

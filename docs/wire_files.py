@@ -150,7 +150,8 @@ def _frame_columns() -> str:
         f'"""{_MARK}"""',
         "",
         "from handtouch import wire",
-        "from handtouch.client.link_column import FloatArray, FrameColumn",
+        "from handtouch.arrays import FloatArray",
+        "from handtouch.client.link_column import FrameColumn",
         "class FrameColumns:",
         '    """Columns of hand frames by link, as attributes."""',
     ]

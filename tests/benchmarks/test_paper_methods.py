@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_methods import LogRatioTable, single_sum_fractions
+from handtouch.arrays import FloatArray
 from handtouch.field import Rectangle
 from handtouch.field.figures import log_ratio
-from handtouch.field.model import FloatArray
 
 SQUARE = Rectangle(1.0, 1.0)
 

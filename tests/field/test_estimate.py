@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import ndtri
 
+from handtouch.arrays import FloatArray
 from handtouch.field import (
     ElectrodeNetwork,
     ForwardModel,
     Rectangle,
     estimate,
 )
-from handtouch.field.model import FloatArray
 
 
 def scatter(pad: Rectangle, count: int, seed: int, margin: float = 0.05) -> tuple[FloatArray, FloatArray]:

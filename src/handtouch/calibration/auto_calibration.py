@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import (
     MAX_GAIN,
     MIN_GAIN,
@@ -37,7 +37,6 @@ from handtouch.field.model import ForwardModel
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 
-FloatArray = NDArray[np.float64]
 _INITIAL_LOG_GAIN_STDS = (0.05, 0.2)
 """Initial standard deviation of log gains; the next one if no gains near these explain the contacts."""
 _CONTACTS_PER_UPDATE = BATCH_CONTACTS // 2

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray
 from handtouch.field.estimate import estimate
-from handtouch.field.model import FloatArray, ForwardModel, FractionModel, channel_noise
+from handtouch.field.model import ForwardModel, FractionModel, channel_noise
 
 UNKNOWNS = 3
 """Unknowns of a contact: position and total."""

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import Gains
 from handtouch.calibration.contact_scores import (
     UNKNOWNS,
@@ -38,7 +39,7 @@ from handtouch.calibration.contact_scores import (
     gain_deviation,
 )
 from handtouch.field.estimate import estimate
-from handtouch.field.model import FloatArray, ForwardModel, FractionModel, channel_noise
+from handtouch.field.model import ForwardModel, FractionModel, channel_noise
 
 # Constants without an origin beside them were chosen; docs/benchmarks/gains.md measures what they yield.
 BATCH_CONTACTS = 32

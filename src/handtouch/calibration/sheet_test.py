@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import Gains, drifted_gains
 from handtouch.calibration.gains import GainEstimator
-from handtouch.field.model import FloatArray
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 

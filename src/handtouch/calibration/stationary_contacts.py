@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
+
 WINDOW_SAMPLES = 4
 """Samples that are checked for motion together."""
 _MAX_FRACTION_CHANGE = 0.012

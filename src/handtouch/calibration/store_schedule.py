@@ -13,6 +13,7 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import (
     CalibrationVersion,
     Offsets,
@@ -20,8 +21,6 @@ from handtouch.calibration.calibration import (
     channel_values,
 )
 from handtouch.sheet import BANK_LEARNED, check_learned
-
-FloatArray = NDArray[np.float64]
 
 _STORE_PERIOD_NS, _FIRST_STORE_DELAY_NS = 3_600_000_000_000, 60_000_000_000
 """Period of storing for one node, and delay of the first."""

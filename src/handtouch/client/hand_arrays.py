@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.arrays import FloatArray
 from handtouch.client.frame_columns import FrameColumns
-from handtouch.client.link_column import FloatArray, FrameColumn, LinkColumn, StatusColumn, TouchedColumn
+from handtouch.client.link_column import FrameColumn, LinkColumn, StatusColumn, TouchedColumn
 from handtouch.client.wrench import (
     GraspMatrix,
     Wrench,

@@ -18,7 +18,6 @@ from handtouch.client.names import link_hint
 T = TypeVar("T")
 DefaultT = TypeVar("DefaultT")
 StatusT = TypeVar("StatusT", bound=wire.StatusCode)
-FloatArray = NDArray[np.float64]
 
 
 class LinkColumn(NDArrayOperatorsMixin, Mapping[str, T], Generic[T]):

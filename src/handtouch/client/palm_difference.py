@@ -9,12 +9,11 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.arrays import FloatArray
 from handtouch.config import Deployment
 
-FloatArray = NDArray[np.float64]
 _STEP = 1e-6  # rad, or m: error of a central difference below 1e-9 of the derivative on a hand
 
 

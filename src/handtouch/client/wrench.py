@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
+
 _MIN_TANGENTIAL_N = 1e-6
 
 

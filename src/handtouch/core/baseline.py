@@ -30,12 +30,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import BoolArray, FloatArray, IntArray
 from handtouch.core.link_load import LinkLoad
 from handtouch.core.state import TickState
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.intp]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md measures what they yield.
 BLOCK_DURATION_NS = 97_000_000  # no multiple of a period: rounding of stamps moves no sample to another block

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.wire import COLUMNS, HandFrame
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 PUBLISHED = {
     name: at
     for name, at in VALUE_SLICES.items()

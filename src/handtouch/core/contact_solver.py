@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.core.memory import RowArray, made_once, view_memory, view_rows
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
@@ -33,7 +34,6 @@ from handtouch.core.stages.tables import PadSurface
 from handtouch.core.stages.tolerances import PartKnowledge
 from handtouch.core.stages.two_sheets import TwoSheets
 
-FloatArray = NDArray[np.float64]
 _MODEL_ARRAYS = (
     "weight",
     "peak_currents_a",

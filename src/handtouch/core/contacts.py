@@ -10,14 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.core.memory import RowArray, view_memory
 from handtouch.core.pad_model import PadModel
 from handtouch.core.stages.detect import ContactDetection
 from handtouch.core.state import TickState
-
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
-FloatArray = NDArray[np.float64]
 
 
 class DetectionSettings(NamedTuple):

@@ -12,15 +12,14 @@ from collections.abc import Callable
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
 from handtouch.hand.rotations import rotation_matrices
 from handtouch.host.units import GRAVITY_M_S2
 
-FloatArray = NDArray[np.float64]
 _INTERVAL_NS = 20_000_000
 """Least time between two updates: a hand that turns over once a second turns by 7 degrees meanwhile."""
 _MIN_CHANGE = 0.01

@@ -6,14 +6,12 @@ Public name: `HandPoses`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.kinematics import LinkPoses
 from handtouch.hand.joints import JointSnapshot
 from handtouch.hand.robot_models import RobotModels
-
-FloatArray = NDArray[np.float64]
 
 
 class HandPoses:

@@ -16,9 +16,8 @@ import math
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 FALSE_CONTACT_PERIOD_S = 100 * 3600.0
 """Time of a pad with one false contact."""

@@ -15,12 +15,9 @@ linear function of the rotation matrix of their link, whose entries are products
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.core.state import LOAD_TERMS, TickState
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _INITIAL_THRESHOLDS = 1.0
 """Standard deviation of a coefficient at first, in thresholds at which a contact begins, for one g."""

@@ -17,12 +17,11 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.model import ChannelModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface_base import Surface
-
-FloatArray = NDArray[np.float64]
 
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.columns import TickResult
-from handtouch.core.contacts import ContactChanges, ContactDetector, IntArray
+from handtouch.core.contacts import ContactChanges, ContactDetector
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
-from handtouch.core.hand_poses import FloatArray, HandPoses
+from handtouch.core.hand_poses import HandPoses
 from handtouch.core.journal import TickJournal
 from handtouch.core.pad_model import PadModel
 from handtouch.core.scene import RequestedOutputs

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import BoolArray
 from handtouch.config.tables import SceneRequest
 from handtouch.core.pad_patterns import PadName, PadNames
 from handtouch.wire import PERCEPT_KINDS
@@ -25,7 +26,6 @@ MAX_CLIENT_CHARACTERS = 32_768
 _USUAL_PADS = 15  # of the paper's hand
 _MAX_SUBSCRIPTIONS = 8
 """Subscriptions that are named for each pad"""
-BoolArray = NDArray[np.bool_]
 _OUTPUTS = ("position", "force", "raw", "palm", "base", *PERCEPT_KINDS)
 
 

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.arrays import IntArray
 from handtouch.core.baseline import Baseline, BaselineSettings
 from handtouch.core.memory import rows_at, view_memory, view_rows
 from handtouch.core.pad_model import PadModel
@@ -26,7 +27,6 @@ from handtouch.core.stages.two_sheets import (
 from handtouch.core.state import TickState
 from handtouch.wire import ContactRadiusStatus, SecondSheetStatusName
 
-IntArray = NDArray[np.intp]
 _RADIUS_STATUS = VALUE_SLICES["contact_radius_status"].start
 _MAX_DEAD_SIGMA = 4.0
 """Deviations of noise and zero that a touched second sheet at least exceeds: the weakest contacts give

@@ -10,16 +10,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.roles import SHEAR, channel_numbers
 from handtouch.core.memory import RowArray
 from handtouch.core.stages.shear import SHEAR_ROW
 from handtouch.field.shear import BarPattern, DiscPattern, ShearPattern, edge_excess, gap_loss
 from handtouch.hand import mount_transform
-
-FloatArray = NDArray[np.float64]
 
 
 class ShearParameters(NamedTuple):

@@ -17,15 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch import sheet
+from handtouch.arrays import BoolArray, FloatArray, IntArray
 from handtouch.config import Behaviour
 from handtouch.core.memory import RowArray, view_memory
 from handtouch.core.stages.loads import SheetInterval, SheetLoads
 from handtouch.core.stages.sheets import SHEET_LOAD_ROW, UPDATE_PERIOD_S, SheetStage
 from handtouch.core.state import SHEET_ELEMENTS, SHEET_PLAYS, TickState
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-IntArray = npt.NDArray[np.intp]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md and soak_sheets.md
 # measure what they yield.

@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.core.memory import row_count, view_memory
 from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES, SHEAR_CHANNELS, SLIP_ROW
 from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
@@ -33,9 +34,7 @@ _ALIGNMENT = 64
 _MAX_PAUSE_NS = 3600 * 10**9
 _NEVER_SAMPLED_NS = 1 << 60
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Uint8Array = NDArray[np.uint8]
 Uint32Array = NDArray[np.uint32]
 

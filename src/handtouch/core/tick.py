@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch.arrays import BoolArray, IntArray
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline, BaselineSettings
 from handtouch.core.columns import PadColumns, TickResult
 from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, make_solver
-from handtouch.core.contacts import BoolArray, ContactDetector, DetectionSettings, IntArray
+from handtouch.core.contacts import ContactDetector, DetectionSettings
 from handtouch.core.pad_model import PadModel
 from handtouch.core.second_sheets import SecondSheets
 from handtouch.core.shear_pads import changed_shear_pads
@@ -23,7 +24,6 @@ from handtouch.core.stages.slip import SlipDetector
 from handtouch.core.state import TickState
 from handtouch.wire import PadState
 
-FloatArray = NDArray[np.float64]
 _TOUCHED = int(PadState.TOUCHED)
 
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from handtouch.arrays import BoolArray, FloatArray
+
 MIN_FADING_THRESHOLD_RATIO = 3.0
 """Force hidden by sheet adaptation, in begin thresholds, from which a sheet counts as fading"""
 _ROTATION_PERIOD_NS = 600_000_000_000

@@ -6,13 +6,11 @@ Public name: `NoiseReport`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.core.tick import TickProcessor
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
-
-FloatArray = NDArray[np.float64]
 
 MAX_NOISE_RATIO = 2.0
 """Measured over stated noise up to which nodes are accepted by `commission` and `conformance`"""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import wire
+from handtouch.arrays import IntArray
 from handtouch.config import Deployment, ObjectTable
 from handtouch.core.columns import TickResult
 from handtouch.core.pipeline import Pipeline
@@ -25,7 +26,6 @@ from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
 from handtouch.wire import PERCEPT_KINDS, ContactRadiusStatus, ForceStatus, PadState, PositionStatus
 
-IntArray = NDArray[np.intp]
 _IDLE_PERIOD_NS = 50_000_000
 """Longest time between two messages of the stream, whose time the process works by"""
 _STOP_DELAY_NS = 30_000_000_000

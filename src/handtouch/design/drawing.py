@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 LAYERS = {
     "CUT": ("#c0392b", 1),

@@ -12,14 +12,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.drawing import LayeredDrawing
 from handtouch.design.flat_pattern import FlatPattern, offset
 from handtouch.design.layout import RING_OF_SIDES, ElectrodeLayout
 from handtouch.design.pad_task import PadTask
-
-FloatArray = NDArray[np.float64]
 
 MARGIN_MM = 3.0
 """Width of the electrodes, outside the sensing area."""

@@ -6,14 +6,13 @@ Public names: `FILM_OHM`, `LEAD_STD_OHM`, `film_position_std`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.config.responses import TwoLayersTable
 from handtouch.design.pad_task import PadTask
 from handtouch.design.response import ContactResponse
 from handtouch.field.two_layers import TwoLayers
 
-FloatArray = NDArray[np.float64]
 FILM_OHM = 400.0
 """Sheet resistance of each film: of the range that docs/responses.md advises"""
 LEAD_STD_OHM: float = TwoLayersTable.model_fields["lead_std_ohm"].default

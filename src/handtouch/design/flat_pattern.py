@@ -9,14 +9,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.layout import BoundaryLengths
 from handtouch.field import ConeSurface, CylinderSurface, PlaneSurface, PrismSurface, Surface
 from handtouch.field.network import perimeter_point
 from handtouch.field.outline_surface import OutlineOnSphere, OutlineSurface
-
-FloatArray = NDArray[np.float64]
 
 _MAX_MITRE = 2.0  # length of a mitre over the offset, at a corner
 _BOUNDARY_STEPS = 240

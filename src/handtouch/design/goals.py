@@ -11,13 +11,12 @@ from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.layout import ElectrodeLayout
 from handtouch.design.pad_task import PadTask
 from handtouch.design.response import ContactResponse, contact_response
 
-FloatArray = NDArray[np.float64]
 Statistic = Literal["worst", "mean"]
 
 SMOOTH_POWER = 24

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.field import ElectrodeNetwork, Surface
 from handtouch.field.outline_surface import OutlineSurface
-
-FloatArray = NDArray[np.float64]
 
 RING_OF_SIDES = ("y0", "xa", "yb", "x0")
 """Sides in the order of the boundary; the higher end of yb and x0 comes first."""

@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.goals import Goal, Statistic, goal_map, goal_value, smooth_value
 from handtouch.design.layout import ElectrodeLayout, FabricationLimits
 from handtouch.design.pad_task import PadTask
 from handtouch.field import Surface
-
-FloatArray = NDArray[np.float64]
 
 _STARTS_ANYWHERE = 3
 _ITERATIONS = 60

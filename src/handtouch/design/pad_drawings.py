@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field import ElectrodeNetwork, PlaneSurface
 from handtouch.field.figures import (
     ACCENT,
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = npt.NDArray[np.float64]
 _MAP_EDGE_FRACTION, _MAP_STEPS = 0.02, 61  # margin of the map, and its points per side
 
 

@@ -9,16 +9,14 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.design.layout import BoundaryLengths, ElectrodeLayout
 from handtouch.field import ContactLaw, Surface
 from handtouch.hand import pad_surface
 from handtouch.hand.expected_error import EDGE_MARGIN, pad_design
 from handtouch.hand.pads import log_aspect_std
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

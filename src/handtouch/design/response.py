@@ -13,13 +13,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.layout import ElectrodeLayout
 from handtouch.design.pad_task import PadTask
 from handtouch.field import ContactLaw, ElectrodeNetwork
-
-FloatArray = NDArray[np.float64]
 
 _POSITION_STEP = 1e-4  # step of differences over the shorter side
 _FORCE_STEP = 1e-3  # step of differences over the force

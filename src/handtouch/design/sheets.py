@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.design.pad_task import PadTask
 from handtouch.field import ContactLaw
 
-FloatArray = NDArray[np.float64]
 ALPHAS = (1.0, 1.5, 2.0)
 """Of films that are compared with the configured one"""
 _SECOND_FILM = 0.25

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.design.deployed import pad_with_layout
 from handtouch.design.goals import PAIR_SCORE, Goal, line_errors, misfit_weights
 from handtouch.design.layout import ElectrodeLayout
@@ -26,7 +26,6 @@ from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_pad import true_gaps
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, Family, World
 
-FloatArray = NDArray[np.float64]
 Shares = Callable[[FloatArray, FloatArray], FloatArray]
 
 CHECKED_GOALS = ("position", "linearity", "two-contacts")

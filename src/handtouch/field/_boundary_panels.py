@@ -18,7 +18,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field.outline import BoolArray, ComplexArray, Edge, FloatArray
+from handtouch.arrays import BoolArray, FloatArray
+from handtouch.field.outline import ComplexArray, Edge
 
 NODES = 16  # per panel
 _MIN_ELLIPSE = 2.7  # sum of semi-axes from which the Gauss rule has 13 digits

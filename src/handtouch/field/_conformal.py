@@ -15,7 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from handtouch.field.outline import ComplexArray, FloatArray, Outline
+from handtouch.arrays import FloatArray
+from handtouch.field.outline import ComplexArray, Outline
 from handtouch.field.outline_network import BoundaryElectrode, OutlineNetwork
 
 _TOLERANCE = 1e-7  # error of the fit over the outline's larger extent

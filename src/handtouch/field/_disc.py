@@ -19,7 +19,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from handtouch.arrays import FloatArray
+
 ComplexArray = npt.NDArray[np.complex128]
 
 

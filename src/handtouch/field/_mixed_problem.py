@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.field._boundary_panels import NODES, TO_LEGENDRE, Panel
-from handtouch.field.outline import BoolArray, ComplexArray, FloatArray
+from handtouch.field.outline import ComplexArray
 
 MAX_UNKNOWNS = 6000
 _AHEAD_COSINE = 0.8

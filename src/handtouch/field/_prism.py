@@ -9,13 +9,8 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field.surface_base import (
-    FloatArray,
-    Surface,
-    broadcast_finite,
-    check_lengths,
-    surface_key,
-)
+from handtouch.arrays import FloatArray
+from handtouch.field.surface_base import Surface, broadcast_finite, check_lengths, surface_key
 
 
 @dataclass(frozen=True)

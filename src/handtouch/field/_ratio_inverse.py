@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.field._separable import SideRatio
-from handtouch.field.model import FloatArray
 
 _MIN_MODULUS = 1e-15  # a smaller modulus changes the inverse by less than rounding
 _MAX_TRIGONOMETRIC_MODULUS = 6e-9  # a complementary modulus below this leaves an arctangent

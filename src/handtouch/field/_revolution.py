@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from handtouch.field.surface_base import (
-    FloatArray,
-    Meridian,
-    SweptSurface,
-    arc_key,
-    check_arc,
-    surface_key,
-)
+from handtouch.arrays import FloatArray
+from handtouch.field.surface_base import Meridian, SweptSurface, arc_key, check_arc, surface_key
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline

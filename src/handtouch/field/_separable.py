@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from handtouch.field.model import FloatArray
+from handtouch.arrays import FloatArray
 
 _TERM_ORDERS = (1, 2, 3)  # theta series: the largest nome used is exp(-pi), and exp(-16 pi) is below rounding
 

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 
 class GroundedElectrodes(ABC):

@@ -15,9 +15,8 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.surface_base import Surface
-
-FloatArray = npt.NDArray[np.float64]
 
 VARIATIONS = 5
 """Ways in which a map may be off in all channels together; as many as waves of a sheet's resistance."""

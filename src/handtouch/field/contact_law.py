@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.contact_stack import stack_factor, stack_inverse
-
-FloatArray = npt.NDArray[np.float64]
 
 MAX_CURRENT_FRACTION = 0.98  # current over the sheet's maximum: beyond it a force is a lower bound
 BOUND_SIGMA = 2.0  # standard deviations

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 _MAX_ABS_LOG_X, _TABLE_NODES = 16.0, 2049  # the table holds |ln x| up to this
 _MIN_ASYMPTOTIC_X = 32.0  # from here on the asymptotic series of the Bessel functions are exact to rounding

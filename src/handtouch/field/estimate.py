@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handtouch.field.model import FloatArray, ForwardModel, channel_noise
-
-BoolArray = NDArray[np.bool_]
+from handtouch.arrays import BoolArray, FloatArray
+from handtouch.field.model import ForwardModel, channel_noise
 
 _MAX_STEPS = 40
 MAX_SETTLED_DECREMENT = 1e-6  # squared Newton decrement, in variances: the last step leaves far less

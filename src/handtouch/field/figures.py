@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field import (
     ContactLaw,
     ElectrodeNetwork,
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FloatArray = npt.NDArray[np.float64]
 
 INK, FAINT, ACCENT, ERRATUM = "#1a1a1a", "#8a8a8a", "#1f6fb4", "#c0392b"
 DPI = 150

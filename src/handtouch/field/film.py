@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.network import ElectrodeEnd, ElectrodeNetwork
-from handtouch.field.surface_base import FloatArray, Surface
+from handtouch.field.surface_base import Surface
 
 MIN_SPOTS = 4
 _END_CELLS, _CELLS = 8, 56  # least between two ends of electrodes, and of a whole side

@@ -22,12 +22,12 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.channel_map import VARIATIONS, ChannelMap
 from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface_base import Surface
 
-FloatArray = npt.NDArray[np.float64]
 MIN_PRESSES = 8
 _GRID_POINTS = 25  # along each side, closer towards its ends
 _TRIED_PRESSES = 40  # by which size and length of the smooth rest are found

@@ -21,9 +21,10 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.field.embedded_file import read_embedded
-from handtouch.field.surface_base import FloatArray, Surface, broadcast_finite, surface_key
-from handtouch.field.triangulation import IntArray, Triangulation, parse_stl
+from handtouch.field.surface_base import Surface, broadcast_finite, surface_key
+from handtouch.field.triangulation import Triangulation, parse_stl
 
 _SIDES = ("y0", "xa", "yb", "x0")  # counter-clockwise from corner (0, 0)
 _M_PER_UNIT = 1e-3

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 
 class FractionModel(Protocol):

@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field._disc import CirclePoints, DiscMap
 from handtouch.field._electrodes import ElectrodePotentials
 from handtouch.field._series_resistors import GroundedElectrodes
@@ -26,7 +27,6 @@ from handtouch.field.estimate import PointEstimate, estimate
 from handtouch.field.rectangle import Location, Rectangle
 from handtouch.field.uneven_sheet import unevenness_slopes
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 Side = Literal["x0", "xa", "y0", "yb"]
 

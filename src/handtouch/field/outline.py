@@ -14,11 +14,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.field.surface_base import MIN_CLEARANCE
 
-FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
-BoolArray = npt.NDArray[np.bool_]
 Point = tuple[float, float]
 
 _MIN_CORNER_RAD = 0.05  # interior angle at a corner, and its distance from a full turn

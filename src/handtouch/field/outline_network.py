@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field._boundary_panels import Stretch, initial_panels
 from handtouch.field._mixed_problem import MixedProblem
 from handtouch.field._series_resistors import GroundedElectrodes
-from handtouch.field.outline import ComplexArray, FloatArray, Outline
+from handtouch.field.outline import ComplexArray, Outline
 from handtouch.field.surface_base import MIN_CLEARANCE
 
 _SMOOTH_ANGLE_RAD = 1e-9

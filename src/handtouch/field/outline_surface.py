@@ -25,9 +25,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field._conformal import ConformalRectangle
 from handtouch.field.outline import ComplexArray, Outline
-from handtouch.field.surface_base import FloatArray, Surface, broadcast_finite, check_lengths, surface_key
+from handtouch.field.surface_base import Surface, broadcast_finite, check_lengths, surface_key
 
 _SIDES = ("y0", "xa", "yb", "x0")  # counter-clockwise from corner (0, 0)
 _MAX_TURN_DEG = 280.0

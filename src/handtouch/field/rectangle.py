@@ -11,10 +11,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray
 from handtouch.field._ratio_inverse import LOGARITHMIC_DEPTH, RatioInverse, distance_in_strip
 from handtouch.field._separable import SideRatio, theta_four, theta_two
 from handtouch.field.estimate import PointEstimate, estimate
-from handtouch.field.model import FloatArray
 
 MAX_ASPECT_RATIO = 1e100
 _HALF_PI = math.pi / 2

@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 EDGE_EXCESS = 2 * math.log(2) / math.pi
 """Width, in thicknesses of the film, that current gains beyond an edge of a plate over a larger one."""

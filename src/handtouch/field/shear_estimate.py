@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from handtouch.field.shear import FilmLaw, FloatArray, ShearPattern
+from handtouch.arrays import FloatArray
+from handtouch.field.shear import FilmLaw, ShearPattern
 
 _MAX_STEPS = 30
 _STEP_TOLERANCE = 1e-10

@@ -35,8 +35,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.surface_base import (
-    FloatArray,
     Meridian,
     Surface,
     SweptSurface,

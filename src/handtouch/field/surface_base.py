@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 
 class SurfaceKinds(Mapping[str, "type[Surface]"]):

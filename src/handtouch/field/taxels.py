@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.channel_map import VARIATIONS, ChannelMap
 from handtouch.field.surface_base import Surface
-
-FloatArray = npt.NDArray[np.float64]
 
 PROFILES: Mapping[str, Callable[[FloatArray], FloatArray]] = MappingProxyType(
     {

@@ -11,8 +11,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
+from handtouch.arrays import FloatArray, IntArray
 
 _MERGED = 1e-6  # distance of vertices that are one, over the extent
 _STL_HEADER = 84

@@ -17,10 +17,10 @@ from statistics import NormalDist
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.field.channel_map import VARIATIONS, ChannelMap
 from handtouch.field.surface_base import Surface
 
-FloatArray = npt.NDArray[np.float64]
 _IMAGES = 2  # on each side, and as many more per a / b; they fall by exp(-2 pi b / a) from one to the next
 _TINY = 1e-30  # variance of leads below which they are exact
 _LEAST_DISTANCE = 1e-9  # of an image, in sides: a contact on an insulated edge is as good as two

@@ -15,11 +15,10 @@ from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray
 from handtouch.field.model import FractionModel
-
-FloatArray = NDArray[np.float64]
 
 UNEVEN_WAVES = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Waves (p, q), cos(p pi x / a) cos(q pi y / b), of the logarithm of an uneven sheet's resistance."""

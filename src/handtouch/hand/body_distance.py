@@ -14,11 +14,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.hand.urdf import BodyShape
 
-FloatArray = NDArray[np.float64]
 _LFS_POINTER = b"version https://git-lfs"
 
 

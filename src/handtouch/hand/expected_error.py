@@ -15,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.field import (
     ContactLaw,
     ElectrodeNetwork,
     Surface,
 )
 from handtouch.hand.pads import electrode_network, pad_surface, sheet_law
-
-FloatArray = npt.NDArray[np.float64]
 
 FIRM_TOUCH_N = 1.0
 EDGE_MARGIN = 0.1  # margin of each side, excluded from medians and worst cases

@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
+from handtouch.arrays import BoolArray, FloatArray, IntArray
+
 _STATES_PER_SOURCE = 64
 """States kept of one source: 64 ms at 1 kHz."""
 _MAX_SOURCES = 16

@@ -8,12 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch.hand.joints import LIMIT_TOLERANCE_M, LIMIT_TOLERANCE_RAD, FollowerJoint
 from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription, UrdfError
-
-FloatArray = NDArray[np.float64]
 
 
 class HandKinematics:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config import (
     ConfigError,
     Deployment,
@@ -34,7 +35,6 @@ from handtouch.hand.pads import MountUncertainty, mount_transform
 from handtouch.hand.urdf import RobotDescription, UrdfError
 from handtouch.host.installation import extra_command
 
-FloatArray = NDArray[np.float64]
 _MAX_PAD_DEPTH_M, _MAX_PAD_HEIGHT_M = 0.003, 0.010
 """Distance of a pad's centre below its link's body, and above it, beyond which its mount is rejected."""
 _OUTWARD_TEST_STEP_M = 0.003

@@ -6,9 +6,8 @@ Public name: `rotation_matrices`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 
 def rotation_matrices(quaternion: FloatArray) -> FloatArray:

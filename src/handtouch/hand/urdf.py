@@ -17,12 +17,11 @@ from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.hand.pads import rotation_from_rpy
 from handtouch.hand.rotations import rotation_matrices
 
-FloatArray = NDArray[np.float64]
 MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 _OTHER_JOINT_TYPES = ("fixed", "floating", "planar")
 _SHAPES = ("box", "cylinder", "capsule", "sphere", "mesh")

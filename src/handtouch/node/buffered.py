@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
-from handtouch.node.iio import IIO_FOLDER, AdcReading, FloatArray, IioDevice, find_trigger
+from handtouch.node.iio import IIO_FOLDER, AdcReading, IioDevice, find_trigger
 from handtouch.node.scan import ScanLayout
 from handtouch.node.settings import Adc
 

@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.node.adc_fault import AdcError, AdcFaultKind
 from handtouch.node.scan import ScanElement
 
-FloatArray = NDArray[np.float64]
 IIO_FOLDER = Path("/sys/bus/iio/devices")
 _MAX_ATTRIBUTE_BYTES = 4096  # size of a page in memory, which limits a file of sysfs
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.hand.expected_error import FIRM_TOUCH_N, error_summary, pad_design
 from handtouch.node.adc_fault import AdcError
 from handtouch.node.excitation import make_switch
-from handtouch.node.iio import FloatArray
 from handtouch.node.pad_input import PadInput
 from handtouch.node.sampling import AdcInput, make_inputs
 from handtouch.node.settings import NodeFile, NodePad

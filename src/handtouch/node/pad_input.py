@@ -10,10 +10,10 @@ import logging
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.canbus import cia301
 from handtouch.device import Device, UnconfiguredDevice
 from handtouch.node.adc_fault import AdcError, AdcFaultKind, emergency_of
-from handtouch.node.iio import FloatArray
 from handtouch.node.settings import NodePad, Trim
 
 _MIN_END = 1 / 50  # of a negative end, over the positive one: nearer to zero, it is the offset of a converter

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.device import UnconfiguredDevice
 from handtouch.node.adc_fault import AdcError
 from handtouch.node.buffered import BufferedReader
-from handtouch.node.iio import AdcReader, AdcReading, FloatArray, OneShotReader
+from handtouch.node.iio import AdcReader, AdcReading, OneShotReader
 from handtouch.node.pad_input import PadInput
 from handtouch.node.settings import Adc, NodeFile
 

@@ -11,8 +11,9 @@ from collections.abc import Generator, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray
 from handtouch.percept.primitives import (
     SHAPE_CLASSES,
     PrimitiveFit,
@@ -21,8 +22,6 @@ from handtouch.percept.primitives import (
     fit_primitive,
     run_to_completion,
 )
-
-FloatArray = NDArray[np.float64]
 
 _MAX_MISFIT_SIGMA = 4.0  # misfit beyond which a class is rejected
 _MIN_CONTACTS, _MIN_CONTACTS_MOVING_OBJECT = 3, 6

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.percept.action_request import Question
-from handtouch.percept.samples import ContactBuffer, ContactSamples, FloatArray, IntArray, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 
 class HandSnapshot(NamedTuple):

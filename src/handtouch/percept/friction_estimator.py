@@ -11,9 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import IntArray
 from handtouch.percept.estimator import PerceptEstimator
 from handtouch.percept.friction import FrictionLimit, FrictionMonitor, FrictionState
-from handtouch.percept.samples import ContactBuffer, ContactSamples, IntArray, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 _EMPTY_NS = 1_000_000_000
 """A hand without contacts for so long grasps another object then."""

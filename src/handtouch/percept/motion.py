@@ -15,14 +15,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import IntArray
 from handtouch.core.stages.slip import MOTION_CLASSES, SlipDetector
 from handtouch.percept.relative_motion import RelativeMotion, slip_probability
-from handtouch.percept.samples import ContactBuffer, IntArray, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, PerceptEstimate
 from handtouch.percept.slip_evidence import SlipEvidence
-
-FloatArray = NDArray[np.float64]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they
 # yield.

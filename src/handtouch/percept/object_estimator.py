@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handtouch import wire
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.config.objects import ObjectTable
 from handtouch.hand.rotations import rotation_matrices
 from handtouch.percept.action_request import Question
@@ -35,9 +35,6 @@ from handtouch.percept.object_pose import (
 from handtouch.percept.object_questions import object_questions
 from handtouch.percept.object_shapes import KnownShape, build_shape
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 # Constants without an origin beside them were chosen on grasps of the tuning family;
 # docs/benchmarks/object.md measures what they yield on others.

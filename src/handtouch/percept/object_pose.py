@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.hand.rotations import rotation_matrices
 from handtouch.percept.object_shapes import KnownShape
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 FREE_ROTATION_RAD2 = math.pi**2 / 3
 """Variance of an angle of which nothing is known."""

@@ -12,14 +12,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.percept.action_request import CandidateAction, Question
 from handtouch.percept.object_pose import PoseHypothesis, Poses, cross
 from handtouch.percept.object_shapes import KnownShape
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 _MAX_HYPOTHESES, _ASKED_ABOUT = 4, 2  # predicting an outcome, and whose surfaces are candidates
 _PLACES, _MAX_ACTIONS = 48, 4
 _START_M, _REACH_M, _CLEARANCE_M = 20e-3, 40e-3, 5e-3

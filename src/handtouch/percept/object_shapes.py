@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from handtouch.arrays import FloatArray
 from handtouch.config.meshes import surface_triangles
 from handtouch.config.objects import (
     BoltShape,
@@ -22,7 +23,6 @@ from handtouch.config.objects import (
 )
 from handtouch.hand.body_distance import squared_distance_from_triangles
 
-FloatArray = NDArray[np.float64]
 _M_PER_MM = 1e-3
 _SHELL_M = 2e-3
 """Thickness of the shell whose points are projected to the surface: edges get about as many as a strip of

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.percept.action_request import ActionRequest, ActionSelector, Question
 from handtouch.percept.estimator import HandSnapshot, PerceptEstimator
 from handtouch.percept.friction_estimator import FrictionEstimator
 from handtouch.percept.object_estimator import ObjectEstimator
-from handtouch.percept.samples import ContactBuffer, ContactSamples, FloatArray, IntArray, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 from handtouch.percept.shape import PairDistanceFunction, ShapeEstimator
 from handtouch.percept.slip_questions import slip_questions
 from handtouch.percept.stiffness_estimator import ExpectedRadius, StiffnessEstimator

@@ -21,7 +21,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
+
 T = TypeVar("T")
 
 # Constants without an origin beside them were chosen; docs/benchmarks/shape.md measures what they yield.

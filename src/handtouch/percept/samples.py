@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
+
 if TYPE_CHECKING:
     from handtouch import wire
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 SAMPLES_PER_CONTACT = 512
 """Samples kept of a contact."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.field import estimate
 from handtouch.field.model import ForwardModel
 from handtouch.percept.action_request import CandidateAction, Question
@@ -24,8 +24,6 @@ from handtouch.percept.classify import ShapeClassification, classify_touches
 from handtouch.percept.estimator import FitSchedule, PerceptEstimator
 from handtouch.percept.primitives import SHAPE_CLASSES, SIZE_PARAMETERS, ShapePrior, Touches
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
-
-FloatArray = NDArray[np.float64]
 
 PairDistanceFunction = Callable[[int, float, float], tuple[float, float]]
 # Constants without an origin beside them were chosen; docs/benchmarks/percept_grasp.md measures what they

@@ -21,8 +21,8 @@ from functools import cache
 from importlib import resources
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.core.memory import view_memory, view_rows
 from handtouch.core.stages.evidence import (
     EVIDENCE_FIELDS,
@@ -33,9 +33,7 @@ from handtouch.core.stages.evidence import (
 from handtouch.core.stages.rows import SLIP_ROW
 from handtouch.core.stages.slip import SlipDetector
 from handtouch.percept.relative_motion import RelativeMotion
-from handtouch.percept.samples import FIELD_SLICES, ContactBuffer, IntArray
-
-FloatArray = NDArray[np.float64]
+from handtouch.percept.samples import FIELD_SLICES, ContactBuffer
 
 FEATURE_WINDOW_S = max(EVIDENCE_WINDOWS_S)
 """Longest time that features look back."""

@@ -20,9 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from handtouch.arrays import IntArray
 from handtouch.field import ContactLaw
 from handtouch.percept.estimator import PerceptEstimator
-from handtouch.percept.samples import ContactBuffer, ContactSamples, IntArray, PerceptEstimate
+from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 
 _MIN_GROWTH = 3.0
 """Greatest over least force of a contact: the radius then grows by 1.44 under a round tip, and not at all

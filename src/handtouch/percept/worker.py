@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from handtouch import wire
+from handtouch.arrays import FloatArray
 from handtouch.config import Deployment, Pad
 from handtouch.core.pad_model import contact_law, law_of, networks_of
 from handtouch.hand import mount_transform, pad_surface
@@ -24,7 +25,6 @@ from handtouch.percept.shape import pair_distance
 from handtouch.percept.stiffness_estimator import ExpectedRadius
 from handtouch.wire import PERCEPT_KINDS
 
-FloatArray = NDArray[np.float64]
 _COLUMNS = wire.COLUMNS[wire.PerceptInput]
 _FIELDS = tuple(name for name in SAMPLE_FIELDS if name in _COLUMNS and name != "pad_noise_m2")
 _SURFACE_GRID = (0.06, 0.35, 0.65, 0.94)

@@ -10,13 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from handtouch.arrays import FloatArray
 from handtouch.hand import urdf
 
-FloatArray = NDArray[np.float64]
 ROOT_FRAME = "handtouch"
 _HAND_SPACING_M = 0.3
 """Distance of hands."""

@@ -17,8 +17,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+from handtouch.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

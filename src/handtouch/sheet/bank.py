@@ -24,11 +24,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import BoolArray, FloatArray, IntArray
 from handtouch.sheet.adaptation import Adaptation
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
-BoolArray = npt.NDArray[np.bool_]
 
 # Constants without an origin beside them were chosen; docs/benchmarks/supervise.md and soak_sheets.md
 # measure what they yield.

@@ -18,12 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.sheet.adaptation import Adaptation, AdaptationState
 from handtouch.sheet.creep import Creep
 from handtouch.sheet.fluctuation import Fluctuation, FluctuationState
 from handtouch.sheet.hysteresis import PrandtlIshlinskii
-
-FloatArray = npt.NDArray[np.float64]
 
 NO_CREEP = Creep(1.0, (), ())
 NO_HYSTERESIS = PrandtlIshlinskii(1.0, (), ())

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from handtouch.arrays import FloatArray
 from handtouch.sheet.adaptation import AdaptationState
 from handtouch.sheet.bank import ModelBank
 from handtouch.sheet.behaviour import SheetModel
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

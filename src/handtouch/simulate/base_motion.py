@@ -10,13 +10,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 from scipy.spatial.transform import Rotation
 
+from handtouch.arrays import FloatArray
 from handtouch.config.base import Positive, Table, Vector3
-
-FloatArray = NDArray[np.float64]
 
 
 class Skin(Table):

@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate import noise
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 HUM_HZ: Final = 49.97
 """Of the mains, a little off its nominal value, as it usually is."""
 _BENDS = 4  # waves of the non-linearity over the converter's range

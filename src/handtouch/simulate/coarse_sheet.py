@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import TABLE_NODES, ElectrodeGaps
 from handtouch.simulate.spectral_elements import ElementAxis
-
-FloatArray = NDArray[np.float64]
 
 _DEGREE = 3
 _SMEAR_FRACTION = 0.04  # standard deviation of a smeared source, of the root of the pad's area

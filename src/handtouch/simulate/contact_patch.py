@@ -8,9 +8,8 @@ from __future__ import annotations
 from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 Profile = Literal["uniform", "hertz", "half_tilted", "tilted", "ring", "two_spots"]
 """Distribution of the pressure over a patch: even; that of Hertz under round objects; rising along the

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 WARM_UP_S: Final = 120.0
 
 

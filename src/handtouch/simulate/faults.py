@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.config.base import Name, NonNegative, OneOfKinds, Positive, Table
 from handtouch.config.tables import SIDE_ELECTRODES, Electrode
 from handtouch.simulate import draws
@@ -24,8 +25,6 @@ from handtouch.simulate.sheet_circuit import Wiring
 from handtouch.simulate.smoothstep import smoothstep_array
 from handtouch.wire.faults import FaultKind
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 Channel = Annotated[str, Field(pattern=r"^(x0|xa|y0|yb|t[1-9][0-9]?)$")]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]

@@ -11,12 +11,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.simulate.pad_geometry import SimulatedSurface
 
-FloatArray = NDArray[np.float64]
 _NEIGHBOURS = 24
 
 

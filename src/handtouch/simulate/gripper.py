@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.problems import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.contact_patch import ContactPatch, discs
@@ -27,7 +27,6 @@ from handtouch.simulate.gripper_objects import (
 )
 from handtouch.simulate.stimulus import AppliedContact, EventlessStimulus
 
-FloatArray = NDArray[np.float64]
 FINGER_LINKS = {"thumb": "thumb_tip", "index": "index_tip"}
 """Link with the pad of each finger."""
 JOINT_LIMITS_M = {"reach": (0.0, 0.1), "lift": (-0.03, 0.03), "thumb": (0.0, 0.03), "index": (0.0, 0.03)}

@@ -13,16 +13,15 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.config.meshes import surface_triangles
 from handtouch.simulate.pad_geometry import SimulatedSurface, SurfaceProjection
 
 if TYPE_CHECKING:
     from handtouch.config.meshes import SurfaceTriangles
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 CELLS = 45.0
 """Square root of the area over the longest side of an element."""

@@ -13,8 +13,8 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.mesh_geometry import CELLS, HeldPotentials, SimulatedMesh
 from handtouch.simulate.outline_solver import RADIUS_TABLE_NODES, log_radius_table
 from handtouch.simulate.sheet_solver import (
@@ -27,7 +27,6 @@ from handtouch.simulate.sheet_solver import (
 )
 from handtouch.simulate.unevenness import Unevenness
 
-FloatArray = NDArray[np.float64]
 _MIN_GAP_FRACTION = 1e-3  # bare gap over a side
 _MUTUAL_CELLS = 25.0  # as `CELLS`, for the many sources of mutual resistances
 _SIDE_OF_ELECTRODE = (3, 1, 0, 2)

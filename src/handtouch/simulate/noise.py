@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.smoothstep import smoothstep_array
 
-FloatArray = NDArray[np.float64]
 KeyArray = NDArray[np.uint64]
 
 WAVE_PERIODS_S: Final = (30.0, 120.0, 480.0, 1920.0, 7680.0, 30720.0)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.pad_geometry import SimulatedSurface, SurfaceProjection
 
-FloatArray = NDArray[np.float64]
 _EDGE = 1e-9  # fraction of the pad: corners have no direction
 _NEWTON_STEPS = 25
 _HULL_POINTS = 96

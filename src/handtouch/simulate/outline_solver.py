@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.sheet_solver import (
     EDGE_INSET_FRACTION,
@@ -29,7 +30,6 @@ from handtouch.simulate.sheet_solver import (
 from handtouch.simulate.spectral_elements import ElementAxis, lobatto_nodes
 from handtouch.simulate.unevenness import Unevenness
 
-FloatArray = NDArray[np.float64]
 _DEGREE, _RADIUS_DEGREE, _ARC_RADIUS_DEGREE = 5, 4, 3  # arcs have more elements
 _MIN_GAP_FRACTION = 1e-3  # bare gap over a side
 _MIN_ARC_FRACTION = 1e-4  # part of an electrode over a side; shorter ones are left out

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.simulate.contact_patch import discs
 from handtouch.simulate.faults import Fault, FaultContacts
 from handtouch.simulate.mesh_geometry import SimulatedMesh
@@ -40,7 +41,6 @@ from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.torn_sheet import cut_sheet_maps, is_beyond_cut
 from handtouch.simulate.unevenness import Unevenness
 
-FloatArray = NDArray[np.float64]
 _MAX_BATCHED_TIMES = 20
 _UNIFORM_DISC_RESISTANCE = 0.25
 """Resistance of a disc with uniform current density, besides ln(R / a), in rho / 2 pi."""

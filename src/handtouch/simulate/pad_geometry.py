@@ -15,10 +15,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import BPoly, CubicSpline, PPoly
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
+
 _ABSCISSAE, _WEIGHTS = np.polynomial.legendre.leggauss(20)
 _PROFILE_CELLS, _NEWTON_STEPS = 400, 3  # cells and steps of a projection to a spline profile
 _HULL_CIRCLE_POINTS, _HULL_PROFILE_CIRCLES = 96, 24

@@ -13,10 +13,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator, RectBivariateSpline
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.responses import ForceLaw
 from handtouch.host.plugins import load_plugins
 from handtouch.simulate.contact_patch import discs
@@ -26,7 +26,6 @@ from handtouch.simulate.solved_contact import PatchNodes
 from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.worlds.response_spread import HiddenResponse
 
-FloatArray = NDArray[np.float64]
 PointResponse = Callable[[FloatArray, FloatArray], FloatArray]
 """Signals (points, n) of unit point loads at points (points, 3) [m] with outward normals (points, 3)."""
 _STEP = 1e-3  # of derivatives, in sides

@@ -15,9 +15,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.truth import GroundTruth, Vector
 
-FloatArray = NDArray[np.float64]
 _MAX_DELAY_PERIODS = 5
 """A contact that begins at most this long after its touch has ended is late, not a false positive."""
 _95_PERCENT_CHI2 = 0.0, 3.841, 5.991, 7.815  # quantiles by degrees of freedom; two along a pad

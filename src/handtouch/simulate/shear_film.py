@@ -13,12 +13,10 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from handtouch.arrays import FloatArray, IntArray
 
 _GRADING = (1e-2, 2.0)  # element at an edge, in thicknesses of the film, and growth from one to the next
 _COARSEST = 2.0

@@ -11,14 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from handtouch.arrays import FloatArray
 from handtouch.config.shear import Bars, CrossedBars, Discs, Pinwheel, Shear
 from handtouch.simulate.shear_film import Plates, solve_section
 from handtouch.simulate.worlds import HiddenShear
-
-FloatArray = NDArray[np.float64]
 
 _MM = 1e-3
 _TABLE_NODES = 7

@@ -13,9 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 _AMPLIFIER_INPUT_OHM = 1e-3
 """Input resistance of an amplifier that holds its electrode at ground."""

@@ -12,10 +12,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate import noise
 from handtouch.simulate.sheet_physics import SheetLaw, SheetStates
-
-FloatArray = NDArray[np.float64]
 
 _LOOK_AHEAD_S = 0.5  # short, so that a live hand doesn't pause for it
 _MAX_SEGMENTS = 64

@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gamma
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.preisach import HomogeneousLoops, Loops, PlayLoops
 from handtouch.simulate.stages.histories import HistoryStage
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _MAX_TURNS: Final = 128
 """Turning points of its load that a sheet remembers, of 64 nested cycles; the smallest are forgotten first"""

@@ -27,11 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh, lu_factor, lu_solve
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.pad_geometry import SheetMetric, SimulatedSurface
 from handtouch.simulate.spectral_elements import ElementAxis, lobatto_nodes
 from handtouch.simulate.stages.patches import NodeTables
-
-FloatArray = NDArray[np.float64]
 
 EDGE_INSET_FRACTION: Final = 0.02
 """Smallest distance from a side at which maps are evaluated, as a fraction of the pad."""

@@ -14,9 +14,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.hand import urdf
 from handtouch.host.units import GRAVITY_M_S2
 from handtouch.simulate.base_motion import BaseTurn, axis_rotations, base_rotation
@@ -24,7 +24,6 @@ from handtouch.simulate.pad_circuit import PadCircuit, layer_of
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.stimulus import JointTrajectory, Stimulus
 
-FloatArray = NDArray[np.float64]
 _STEP_S = 0.01  # of the accelerations: motions of a hand are slower
 _NODES = 5  # along each side of a pad
 _KEPT_CHUNKS, _CHUNK_STEPS = 600, 100

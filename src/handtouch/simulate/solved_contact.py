@@ -23,13 +23,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.contact_patch import PROFILES, half_axes
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.stages.patches import NodeSystems
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 NODES: Final = 24  # of a patch
 _RINGS, _SPOT_RINGS = 3, 2

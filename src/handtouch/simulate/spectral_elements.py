@@ -13,9 +13,8 @@ from functools import cache
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from handtouch.arrays import FloatArray
 
 _GRADING_RATIO = 0.25  # ratio of successive elements towards a square-root singularity of the potential
 _MIN_ELEMENT_FRACTION = 1e-3  # shortest element over the axis

@@ -11,10 +11,9 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from handtouch.arrays import FloatArray
 from handtouch.config.base import Name, Positive, PositivePerChannel, Table
 from handtouch.config.tables import Unsigned32
 from handtouch.hand.urdf import RobotDescription
@@ -22,8 +21,6 @@ from handtouch.simulate.base_motion import BaseTurn, Skin
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.faults import Fault
 from handtouch.simulate.node_faults import NodeFault
-
-FloatArray = NDArray[np.float64]
 
 
 class AppliedContact(NamedTuple):

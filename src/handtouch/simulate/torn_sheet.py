@@ -12,13 +12,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.coarse_sheet import CoarseGrid, CoarseSolution
 from handtouch.simulate.mesh_geometry import SimulatedMesh
 from handtouch.simulate.outline_geometry import SimulatedOutline
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 
-FloatArray = NDArray[np.float64]
 CornerCut = tuple[str, float, float]
 """Corner, such as x0y0, and lost lengths of the sides along x and y [m]."""
 

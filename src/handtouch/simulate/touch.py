@@ -13,14 +13,13 @@ from functools import cached_property
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from handtouch.arrays import FloatArray
 from handtouch.config.base import Name, Positive, Table
 from handtouch.simulate.contact_patch import ContactPatch, Profile, discs
 from handtouch.simulate.smoothstep import smoothstep, smoothstep_array
 
-FloatArray = NDArray[np.float64]
 _Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 _Force2 = Annotated[tuple[float, float], Field(strict=False)]
 _Point = Annotated[tuple[_Fraction, _Fraction], Field(strict=False)]

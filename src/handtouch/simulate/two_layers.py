@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.simulate.pad_circuit import layer_of
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.response_circuit import ResponseCircuit
@@ -24,7 +24,6 @@ from handtouch.simulate.solved_contact import PatchNodes, solve_patches
 from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.worlds.world import UNEVEN_MODES, HiddenPad
 
-FloatArray = NDArray[np.float64]
 _CELLS = 64  # along each side
 _TERMS = 60  # of the series of Green's function
 

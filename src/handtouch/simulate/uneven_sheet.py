@@ -15,7 +15,6 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch.simulate.coarse_sheet import CoarseGrid
 from handtouch.simulate.mesh_geometry import SimulatedMesh
@@ -33,8 +32,6 @@ from handtouch.simulate.sheet_solver import (
 )
 from handtouch.simulate.spectral_elements import lobatto_nodes
 from handtouch.simulate.unevenness import Unevenness
-
-FloatArray = NDArray[np.float64]
 
 _DEGREE = 8
 _NODES = 0.5 + (0.5 - EDGE_INSET_FRACTION) * lobatto_nodes(_DEGREE)

@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.film import FilmRatio
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

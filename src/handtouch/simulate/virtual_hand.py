@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.roles import channel_count
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.simulate import noise
@@ -42,7 +43,6 @@ from handtouch.simulate.unevenness import wave_ratio
 from handtouch.simulate.virtual_pad import VirtualPad, channel_errors_of, drift_of
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 _Number = TypeVar("_Number", bound=np.generic)
 _QUANTISATION_VARIANCE = 1 / 12  # counts^2, by rounding
 _KEY_STEP = np.uint64(0xBF58476D1CE4E5B9)  # between the noise streams of equal hands

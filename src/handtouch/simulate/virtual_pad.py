@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.channels import Channels, node_channels, order_by_electrode
 from handtouch.config.responses import TwoLayersTable
 from handtouch.config.roles import ELECTRODE, SECOND_SHEET, channel_numbers
@@ -48,7 +49,6 @@ from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_shear import VirtualShear
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad
 
-FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]
 _FAULTS_OF_SHEETS = Moisture, ShortedElectrode, SwappedCables, TornCorner
 _IDEAL_SHEET_GAIN_PER_K = 0.01  # as the paper's sheets

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.channels import node_channels
 from handtouch.config.roles import SHEAR, channel_numbers
 from handtouch.config.tables import SIDE_ELECTRODES
@@ -17,7 +18,6 @@ from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
 from handtouch.simulate.stimulus import PadStimulus
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 CountArray = NDArray[np.int64]
 _STEP_S = 4e-3
 _CHUNK_STEPS = 50

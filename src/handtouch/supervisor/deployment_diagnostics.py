@@ -10,10 +10,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import Gains
 from handtouch.config import Deployment
 from handtouch.supervisor import diagnose
-from handtouch.supervisor.ipc import FloatArray, SampleBlock
+from handtouch.supervisor.ipc import SampleBlock
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
 

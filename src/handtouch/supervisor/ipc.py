@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import (
     MAX_GAIN,
     MIN_GAIN,
@@ -33,7 +34,6 @@ MAX_DIAGNOSES = 8
 """Number of diagnoses of one pad in a message."""
 MAX_TEXT = 1000
 """Number of characters of a text in a message."""
-FloatArray = NDArray[np.float64]
 ShortText = Annotated[str, Field(max_length=MAX_TEXT)]
 GainFactor = Annotated[float, Field(ge=MIN_GAIN, le=MAX_GAIN)]
 PositiveFloat = Annotated[float, Field(gt=0)]

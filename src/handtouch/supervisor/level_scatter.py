@@ -10,10 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.core.least_threshold import begin_samples, running_means
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _MIN_S, _MEMORY_S = 60.0, 3600.0
 """Untouched time from which a scatter is known, and that over which it is a mean."""

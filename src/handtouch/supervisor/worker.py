@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.auto_calibration import AutoCalibrator
 from handtouch.calibration.calibration import (
     NEW_SHEET_METHOD,
@@ -51,7 +52,6 @@ from handtouch.supervisor.ipc import (
     CalibrationAssessment,
     CalibrationUpdate,
     DaemonMessage,
-    FloatArray,
     ManualCalibration,
     NodeSerials,
     SampleBlock,

@@ -13,12 +13,11 @@ from typing import Any, cast
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.wire.codec import SCHEMA_VERSION, WireError, check_fields, unpack
 from handtouch.wire.topics import Topic
 
-FloatArray = NDArray[np.float64]
 _MAX_NAMES = 1000
 _MAX_NAME_CHARACTERS = 200
 _MAX_T_NS = 2**63 - 1

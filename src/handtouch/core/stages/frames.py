@@ -22,12 +22,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from handtouch.arrays import BoolArray, FloatArray, IntArray
     from handtouch.core.columns import TickResult
-    from handtouch.core.contacts import BoolArray, IntArray
     from handtouch.core.state import TickState
     from handtouch.hand.robot_models import RobotModels
 
-    FloatArray = NDArray[np.float64]
 
 _PLACES = slices_of(CONTACT_FRAMES)
 _BASE, _AGE = _PLACES["base_position_m"].start, _PLACES["joints_age_s"].start

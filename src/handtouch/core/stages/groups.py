@@ -14,9 +14,9 @@ from handtouch.core.memory import RowArray, view_memory
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from handtouch.arrays import FloatArray
     from handtouch.core.state import TickState
 
-    FloatArray = NDArray[np.float64]
 
 _SPLIT_DISTANCE2_RATIO = 1.25 * 1.25
 """Squared distance that splits two contacts over that which joins them: hysteresis against flicker."""

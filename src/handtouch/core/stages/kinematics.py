@@ -14,11 +14,11 @@ import numpy as np
 from handtouch.core.memory import RowArray, view_memory, view_rows
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from handtouch.arrays import FloatArray
     from handtouch.hand.kinematics import HandKinematics
 
-    FloatArray = NDArray[np.float64]
 
 JOINT_ROW = np.dtype(
     [

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from handtouch.arrays import FloatArray
     from handtouch.core.slab import Slab
     from handtouch.core.state import TickState
 
-    FloatArray = NDArray[np.float64]
 
 _CHANNELS, _UNKNOWNS, _POINT = SHEAR_CHANNELS, 3, 6
 SHEAR_ROW = np.dtype(

@@ -39,9 +39,9 @@ from handtouch.core.stages.solve import VALUE_ROW
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from handtouch.arrays import FloatArray
     from handtouch.core.state import TickState
 
-    FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.intp]
 

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from handtouch import config
+    from handtouch.arrays import FloatArray
     from handtouch.field.model import ChannelModel
     from handtouch.field.surface_base import Surface
 
-    FloatArray = NDArray[np.float64]
 
 _WAVES = 5  # of the sheet resistance
 _M_PER_MM = 1e-3

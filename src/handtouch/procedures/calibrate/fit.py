@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
+from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import LawParameters, matrix
 from handtouch.field import ContactLaw
 from handtouch.procedures.calibrate.readings import ContactCircuit, WeightReading
 
-FloatArray = NDArray[np.float64]
 PARAMETERS = ("contact_ohm_mm2", "alpha", "ohm_per_square")
 
 SHEET_LOG_STD = 0.2

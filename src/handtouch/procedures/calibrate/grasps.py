@@ -18,15 +18,14 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, ValidationError
 
+from handtouch.arrays import FloatArray
 from handtouch.config.base import NonNegative, Positive, Table, Vector3
 from handtouch.hand.urdf import MOVABLE_JOINT_TYPES, RobotDescription
 from handtouch.host.units import GRAVITY_M_S2
 from handtouch.procedures.calibrate.readings import Weight, WeightReading
 
-FloatArray = NDArray[np.float64]
 _FRICTION_STD = 0.5
 """Standard deviation of each tangential force over the normal one: friction coefficients of 0.3 to 1."""
 _MIN_SCALE_N, _MAX_FORCE_N = 0.1, 1e3

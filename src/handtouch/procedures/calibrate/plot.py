@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.procedures.calibrate.fit import LawFit
 from handtouch.procedures.calibrate.readings import ContactCircuit, WeightReading
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-FloatArray = NDArray[np.float64]
 _WIDTH, _HEIGHT = 60, 15
 _FORCE_MARGIN = 1.3  # range of the plot beyond the lightest and heaviest weight
 _INK, _FIT, _BAND, _FAINT = "#1a1a1a", "#1f6fb4", "#1f6fb4", "#8a8a8a"

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.responses import Measured
 from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
@@ -27,7 +27,6 @@ from handtouch.field.model import ChannelModel
 from handtouch.hand import models_with_other_parts, pad_channels, pad_surface
 from handtouch.hand.pads import press_map
 
-FloatArray = NDArray[np.float64]
 _SETTLED_NS, _UNTOUCHED_NS, _MARGIN_NS = 300_000_000, 1_000_000_000, 150_000_000
 """Times of a press before it counts, of the zero before it, and next to begin and end that don't count."""
 _MIN_SAMPLES = 5

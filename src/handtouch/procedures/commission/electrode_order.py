@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import ChannelModel
 from handtouch.field.surface_base import Surface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 PRESS_TARGETS: dict[str, tuple[float, float]] = {
     "x0": (0.15, 0.5),

@@ -13,10 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.core.least_threshold import level_scatter
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 PRESS_THRESHOLD_SIGMA = 100.0  # about 0.3 % of the usual range
 RELEASE_THRESHOLD_SIGMA = 40.0  # far above noise, far below a press

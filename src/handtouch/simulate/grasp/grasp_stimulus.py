@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.config import ConfigError, Problem
 from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.base_motion import BaseTurn, Skin
@@ -25,8 +25,6 @@ from handtouch.simulate.node_faults import NodeFault
 from handtouch.simulate.stimulus import AppliedContact, JointTrajectory, NodeReplacement
 from handtouch.simulate.worlds import DrawnWorld, HiddenJoints
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 _FORCE_SAMPLING_STEPS = 8  # between samples of the force for the sheet's history
 _MIN_GAP_STEPS = 20  # shorter interruptions don't end a press
 _ROUNDING_STEPS = 1e-6  # tolerance for rounded times of steps

@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.hand.pads import rotation_from_rpy
 from handtouch.simulate.grasp.grasp_objects import GraspObject
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 TIME_STEP_S = 1e-3
 _SKIN_THICKNESS_M = 1.5e-3  # URDF bodies are shrunk by this, so that objects touch the pads
 _PLATE_HALF_THICKNESS_M = 2e-3

@@ -14,13 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
 from handtouch.simulate.grasp.simulation import GraspRecord
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _SKIN_MODULUS_PA = 1.0e6  # effective modulus of a rubber skin on a hard object
 _MIN_RADIUS_M, _MAX_RADIUS_M = 0.5e-3, 5e-3

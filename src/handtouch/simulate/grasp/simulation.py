@@ -14,13 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS, GraspObject
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.smoothstep import smoothstep_array
 from handtouch.simulate.worlds import WORLDS, DrawnWorld
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 _CLOSE_START_S, _CLOSE_END_S, _RELEASE_S = 0.3, 1.4, 1.6
 _SQUEEZE_STARTS_S, _SQUEEZE_DURATION_S, _SQUEEZE_TORQUE_RATIO = (2.0, 2.9), 0.7, 2.0

@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.simulate.grasp.simulation import GraspRecord
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

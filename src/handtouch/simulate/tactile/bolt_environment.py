@@ -18,7 +18,6 @@ from handtouch.learn import TouchFeatures
 from handtouch.simulate.tactile.bolt_scene import BoltStart
 from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Sensed
 
-FloatArray = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
 
 STAGES = ("lying", "touched", "lifted", "inserted")

@@ -14,9 +14,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.simulate.grasp.mujoco_scene import (
     HAND_COLLISION_BIT,
     OBJECT_COLLISION_BIT,
@@ -28,7 +28,6 @@ from handtouch.simulate.grasp.mujoco_scene import (
 )
 from handtouch.simulate.worlds import DrawnWorld
 
-FloatArray = NDArray[np.float64]
 HOLE_M = np.array([0.0, 0.25, 0.14])
 """Centre of the hole on the near face of the plate."""
 _PLATE_M, _PLATE_RADIUS_M, _WEDGES = 8e-3, 0.03, 24

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config import shipped
 from handtouch.simulate.tactile.bolt_scene import BoltScene, BoltStart
 from handtouch.simulate.tactile.reading import TactileReading
@@ -18,7 +18,6 @@ from handtouch.simulate.tactile.sensor import TactileSensor
 from handtouch.simulate.tactile.served_touch import ServedTouch
 from handtouch.simulate.worlds import world_named
 
-FloatArray = NDArray[np.float64]
 Pose = tuple[FloatArray, FloatArray]
 """Position (3,) and rotation (3, 3)."""
 PERIOD_MS = 10.0

@@ -20,11 +20,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config import shipped
 from handtouch.learn import TouchFeatures
 from handtouch.simulate.tactile.sensor import TactileSensor
 
-FloatArray = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
 
 PERIOD_S = 0.01

@@ -8,11 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.sheet_history import random_factor
 from handtouch.simulate.sheet_physics import SheetLaw, SheetStates
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 
 class LiveSheets:

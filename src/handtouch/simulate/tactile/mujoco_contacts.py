@@ -12,12 +12,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
+from handtouch.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray, IntArray
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.contact_patch import discs as evenly_pressed
 from handtouch.simulate.grasp.mujoco_scene import MujocoPad
@@ -23,9 +24,6 @@ from handtouch.simulate.tactile.live_sheet import LiveSheets
 from handtouch.simulate.tactile.mujoco_contacts import LinkPoints
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import DrawnWorld
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.intp]
 
 
 class SimulatedPads:

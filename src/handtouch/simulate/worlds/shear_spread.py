@@ -10,13 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from handtouch.arrays import FloatArray
 from handtouch.config.shear import Discs, Shear
 from handtouch.simulate.worlds.distributions import Distribution, Fixed
 
-FloatArray = NDArray[np.float64]
 _ZERO, _ONE = Fixed(0.0), Fixed(1.0)
 
 

@@ -10,9 +10,9 @@ import zlib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.hand.pads import mount_transform, rotation_from_rpy
 from handtouch.simulate.contact_patch import ContactPatch, Profile
 from handtouch.simulate.pad_geometry import SimulatedSurface
@@ -31,7 +31,6 @@ from handtouch.simulate.worlds.spreads import (
     SheetSpread,
 )
 
-FloatArray = NDArray[np.float64]
 PerElectrode = tuple[float, ...]
 _MIN_RADIUS_RATIO = 0.3
 _UNEVENNESS_STD, _ELONGATION_STD, _TILT_STD = 0.01, 0.4, 0.3

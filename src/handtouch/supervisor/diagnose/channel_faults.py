@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from handtouch.arrays import FloatArray
 from handtouch.supervisor.diagnose.features import BlockFeatures
-from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray
+from handtouch.supervisor.diagnose.model import DiagnosisModel
 from handtouch.wire.faults import FaultKind
 
 # Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md measures what they yield.

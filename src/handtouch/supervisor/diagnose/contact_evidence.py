@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.supervisor.diagnose.hypotheses import Scores
-from handtouch.supervisor.diagnose.model import FloatArray
 
 # Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.

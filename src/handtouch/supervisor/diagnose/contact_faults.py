@@ -27,9 +27,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.supervisor.diagnose.contact_evidence import Evidence, explain_contacts
 from handtouch.supervisor.diagnose.hypotheses import ContactCurrents, Hypothesis, HypothesisTables, Scores
-from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.wire.faults import FaultKind
 
 # Constants without another origin were tuned by hand on episodes of benchmarks/diagnose_episodes.py with

@@ -11,12 +11,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.estimate import estimate
 from handtouch.supervisor.diagnose.channel_faults import ChannelFault
 from handtouch.supervisor.diagnose.contact_faults import ContactFault
 from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrode
-from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, PadDiagnosis
+from handtouch.supervisor.diagnose.model import DiagnosisModel, PadDiagnosis
 from handtouch.supervisor.diagnose.static_load import StaticLoad
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.field.model import ChannelModel
-from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, HandSamples
+from handtouch.supervisor.diagnose.model import DiagnosisModel, HandSamples
 
 GROUP_SAMPLES = 5
 """Samples of a short mean: 25 ms at 200 Hz, during which a contact hardly moves."""

@@ -12,8 +12,9 @@ from collections.abc import Hashable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from handtouch.arrays import BoolArray, FloatArray
 from handtouch.supervisor.diagnose.channel_faults import ChannelFaultDetector
 from handtouch.supervisor.diagnose.contact_faults import ContactFaultDetector
 from handtouch.supervisor.diagnose.descriptions import (
@@ -32,17 +33,11 @@ from handtouch.supervisor.diagnose.features import (
 )
 from handtouch.supervisor.diagnose.hypotheses import MIN_CHANNELS, ContactCurrents, HypothesisTables
 from handtouch.supervisor.diagnose.loose_electrodes import LooseElectrodeDetector
-from handtouch.supervisor.diagnose.model import (
-    DiagnosisModel,
-    FloatArray,
-    HandSamples,
-    PadDiagnosis,
-)
+from handtouch.supervisor.diagnose.model import DiagnosisModel, HandSamples, PadDiagnosis
 from handtouch.supervisor.diagnose.offset_steps import OffsetStepDetector
 from handtouch.supervisor.diagnose.static_load import StaticLoad, StaticLoadDetector
 from handtouch.wire.faults import FaultKind
 
-BoolArray = NDArray[np.bool_]
 # Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md and soak_alarms.md measure
 # what they yield.
 _MIN_CONFIDENCE_CHANGE = 0.3  # that is reported,

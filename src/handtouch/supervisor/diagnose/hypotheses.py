@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.config.tables import SIDE_ELECTRODES
 from handtouch.field.model import ChannelModel, FractionModel
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface_base import Surface
-from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.supervisor.diagnose.sheet_changes import CORNERS, SheetChanges
 from handtouch.wire.faults import FaultKind
 

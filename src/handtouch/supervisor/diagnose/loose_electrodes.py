@@ -20,7 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, HandSamples
+from handtouch.arrays import FloatArray
+from handtouch.supervisor.diagnose.model import DiagnosisModel, HandSamples
 
 # Constants without an origin beside them were chosen; docs/benchmarks/diagnose.md measures what they yield.
 MIN_STEPS = 3

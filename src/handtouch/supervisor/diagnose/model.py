@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch import config
+from handtouch.arrays import FloatArray
 from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.core.pad_model import ampere_per_count_of
 from handtouch.field.model import ChannelModel, FractionModel
@@ -27,8 +28,6 @@ from handtouch.hand import (
 )
 from handtouch.wire.faults import FaultKind
 from handtouch.wire.health import Diagnosis
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

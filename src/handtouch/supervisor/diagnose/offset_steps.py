@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from handtouch.supervisor.diagnose.model import DiagnosisModel, FloatArray, HandSamples
+from handtouch.arrays import FloatArray
+from handtouch.supervisor.diagnose.model import DiagnosisModel, HandSamples
 from handtouch.supervisor.diagnose.static_load import MIN_LOAD_COUNTS, StaticLoad
 from handtouch.wire.faults import FaultKind
 

@@ -15,9 +15,9 @@ from scipy import sparse
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import splu
 
+from handtouch.arrays import FloatArray
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.surface_base import Surface
-from handtouch.supervisor.diagnose.model import FloatArray
 
 _CELLS_PER_SIDE = 40  # a side
 _CUT_CONDUCTIVITY = 1e-9  # beyond the cut, relative

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from handtouch.arrays import FloatArray
 from handtouch.supervisor.diagnose.features import GROUP_SAMPLES, approximate_position
-from handtouch.supervisor.diagnose.model import FloatArray
 from handtouch.wire.faults import FaultKind
 
 MIN_LOAD_COUNTS = 12.0

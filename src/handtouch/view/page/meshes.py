@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.field.surface_base import Surface
 from handtouch.hand.body_distance import find_mesh, load_triangles
 from handtouch.hand.urdf import BodyShape
 
-FloatArray = NDArray[np.float64]
 _CIRCLE_SEGMENTS = 40
 """Segments of a circle."""
 _PAD_GRID_CELLS = 14

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from handtouch import wire
+from handtouch.arrays import FloatArray
 from handtouch.client import columns
 from handtouch.config import Deployment
 from handtouch.view.message_lines import (
@@ -27,7 +27,6 @@ from handtouch.view.message_lines import (
 from handtouch.view.page.percepts import PerceptSummaries
 from handtouch.view.page.scene_graph import scene_of
 
-FloatArray = NDArray[np.float64]
 _MAX_MESSAGES = 60
 _PAD_STATES = tuple(state.name.lower() for state in wire.PadState)
 _OK_STATES = ("clear", "touched")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch.arrays import FloatArray
 from handtouch.config import Deployment, HandTable, Pad
 from handtouch.hand import urdf
 from handtouch.hand.pads import mount_transform, pad_surface
@@ -25,7 +25,6 @@ from handtouch.view.page.meshes import (
     to_base64,
 )
 
-FloatArray = NDArray[np.float64]
 Pose = tuple[FloatArray, FloatArray]
 _MAX_CORNERS = 150_000
 """Corners of a link's visual shapes above which its collision shapes are drawn: 50,000 triangles, 3.6 MB"""
