@@ -77,20 +77,24 @@ bolt: $(VENV)/.dev $(VENV)/.core ## find a bolt by touch and start it in a hole,
 
 # --- test
 
-.PHONY: test check others lint types unit fastest coverage socketcan docs tables wiring
+.PHONY: test check lint types unit fastest coverage socketcan docs tables wiring
 test: ## run everything that CI runs
-	@mkdir -p build; log=build/socketcan.txt; : >$$log; \
-	$(MAKE) --no-print-directory --jobs=2 TO=">$$log 2>&1" socketcan others; status=$$?; cat $$log; exit $$status
-	@$(MAKE) --no-print-directory unit ARGS="$(addprefix --ignore=,$(COMPUTED)) $(ARGS)"
+	@mkdir -p build; log=build/computed.txt; : >$$log; \
+	$(MAKE) --no-print-directory --jobs=2 TO=">$$log 2>&1" timed computed; status=$$?; cat $$log; exit $$status
 
 check: ## run lint, types and the fastest tests, as far as `make test` measured them
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types fastest
 
-# beside the tests on SocketCAN, which need a processor in time, what waits for nothing: it fills their three minutes
-COMPUTED := tests/core
-others: $(VENV)/.dev $(VENV)/.core
-	@nice -n 5 $(MAKE) --no-print-directory lint types docs
-	@nice -n 10 $(BIN)/python -m pytest $(COMPUTED) $(ARGS)
+# processes of tests wait for one another half of the time; what waits for nothing fills it, and gives way
+COMPUTED := $(addprefix tests/,calibration canbus config core design field percept sheet simulate supervisor wire)
+.PHONY: timed computed
+timed: $(VENV)/.dev $(VENV)/.core
+	@$(MAKE) --no-print-directory socketcan
+	@$(MAKE) --no-print-directory unit ARGS="$(addprefix --ignore=,$(COMPUTED)) $(ARGS)"
+
+computed: $(VENV)/.dev $(VENV)/.core
+	@{ nice -n 5 $(MAKE) --no-print-directory lint types docs && \
+	nice -n 10 $(BIN)/python -m pytest -q -m "not socketcan" $(COMPUTED) $(ARGS); } $(TO)
 
 # for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
@@ -128,7 +132,7 @@ coverage: $(VENV)/.dev ## run them with a report of lines not covered; slower
 
 socketcan: $(VENV)/.dev $(VENV)/.core ## run the tests on SocketCAN; skipped without it, which fails CI
 	@marked=$$(grep -rl --include='*.py' 'mark\.socketcan' tests); \
-	VCAN_RUN_TIMEOUT=900 tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS) $(TO); status=$$?; \
+	VCAN_RUN_TIMEOUT=900 tests/socketcan/vcan-run $(BIN)/python -m pytest -m socketcan $$marked $(ARGS); status=$$?; \
 	if [ $$status -eq 77 ] && [ "$(CI)" != true ]; then echo "SocketCAN tests SKIPPED, see the reason above"; exit 0; \
 	elif [ $$status -eq 77 ]; then echo "SocketCAN tests were skipped, and CI needs them"; exit 1; fi; exit $$status
 
