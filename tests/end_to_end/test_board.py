@@ -19,7 +19,7 @@ from handtouch import connect, wire
 from handtouch.config import Deployment, load, shipped
 from handtouch.hand import pad_channels, pad_surface
 from tests.deployments import arcs_text
-from tests.starter import find_port, own_endpoints
+from tests.starter import Started, Starter, find_port, own_endpoints
 
 ROOT = Path(__file__).parents[2]
 CHANNEL = "239.74.163.2"
@@ -163,13 +163,13 @@ while True:
 class Bench:
     """A deployment served by `handtouch node` on a bus of its own."""
 
-    def __init__(self, folder: Path, endpoints: dict[str, str], prefix: list[str]) -> None:
-        self.folder, self.endpoints, self._prefix = folder, endpoints, prefix
+    def __init__(self, folder: Path, endpoints: dict[str, str], prefix: list[str], starter: Starter) -> None:
+        self.folder, self.endpoints, self._prefix, self._starter = folder, endpoints, prefix, starter
         self.bus = (
             f'interface = "udp_multicast"\nchannel = "{CHANNEL}"\noptions = {{ port = {find_port()} }}\n'
         )
         self.config = folder / "hand.toml"
-        self._running: list[subprocess.Popen[bytes]] = []
+        self._running: list[subprocess.Popen[bytes] | Started] = []
 
     def write_hand(self, text: str, *changes: tuple[str, str]) -> Deployment:
         settings = "".join(f'{name} = "{endpoint}"\n' for name, endpoint in self.endpoints.items())
@@ -196,12 +196,14 @@ class Bench:
     def start(self, *command: str, **options: Any) -> subprocess.Popen[bytes]:
         words = [*self._prefix, sys.executable, *command]
         with (self.folder / f"{len(self._running)}.txt").open("wb") as output:
-            self._running.append(subprocess.Popen(words, **{"stdout": output, "stderr": output, **options}))
-        return self._running[-1]
+            started = subprocess.Popen(words, **{"stdout": output, "stderr": output, **options})
+        self._running.append(started)
+        return started
 
-    def serve(self, node: Path) -> None:
-        self.start("-m", "handtouch", "node", str(node))
-        self.start("-m", "handtouch", "run", str(self.config))
+    def serve(self, *nodes: Path) -> None:
+        for words in (*(("node", str(node)) for node in nodes), ("run", str(self.config))):
+            with (self.folder / f"{len(self._running)}.txt").open("w") as output:
+                self._running.append(self._starter.start([*words], output))
 
     def outputs(self) -> list[str]:
         return [path.read_text() for path in sorted(self.folder.glob("*.txt"))]
@@ -255,9 +257,9 @@ class Client:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, network: list[str]) -> Iterator[Bench]:
+def bench(tmp_path: Path, network: list[str], starter: Starter) -> Iterator[Bench]:
     with own_endpoints() as endpoints:
-        made = Bench(tmp_path, endpoints, network)
+        made = Bench(tmp_path, endpoints, network, starter)
         yield made
         made.end()
 
@@ -353,7 +355,7 @@ def test_the_commands_of_the_how_to_show_contacts_on_links(bench: Bench) -> None
     assert board.stdout is not None
     with board.stdout:
         bench.start("-m", "handtouch", "node", str(node), stdin=board.stdout)
-    bench.start("-m", "handtouch", "run", str(bench.config))
+    bench.serve()
     links = set()
     with Client(bench, "*") as client:
         for _ in range(60):
