@@ -166,6 +166,9 @@ def _become(asked: Any, output: int) -> None:
     os.dup2(output, 1)
     os.dup2(output, 2)
     os.close(output)
+    # those of the loaded process were opened as a file, and `output` may be a pipe
+    sys.stdout = os.fdopen(1, "w", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     libc = ctypes.CDLL(None, use_errno=True)
     for path in namespaces:
         with open(path) as namespace:

@@ -9,8 +9,8 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
@@ -18,6 +18,7 @@ import pytest
 
 import handtouch
 from handtouch.host.endpoints import LIVE_ENDPOINT
+from tests.starter import Started, Starter
 
 
 def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
@@ -43,9 +44,20 @@ def test_demo_locates_touches_near_the_noise_bound_and_ends() -> None:
 
 
 def test_demo_without_compiled_core_lowers_its_rate_and_shows_contacts(tmp_path: Path) -> None:
-    with (tmp_path / "stderr").open("w") as errors:
-        uncompiled = {**os.environ, "HANDTOUCH_UNCOMPILED": "1"}
-        rest = _interrupted_at(" begin ", "--world", "ideal", env=uncompiled, stderr=errors)
+    command = [sys.executable, "-m", "handtouch", "demo", "--plain", "--world", "ideal"]
+    uncompiled = {**os.environ, "HANDTOUCH_UNCOMPILED": "1"}
+    with (
+        (tmp_path / "stderr").open("w") as errors,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=uncompiled) as demo,
+    ):
+        assert demo.stdout is not None
+        try:
+            assert any(" begin " in line for line in demo.stdout)
+            demo.send_signal(signal.SIGINT)
+            rest = demo.stdout.read()
+            assert demo.wait(30) == 0
+        finally:
+            demo.kill()
     assert "touches found" in rest
     printed = (tmp_path / "stderr").read_text()
     lowered = re.search(r"core uncompiled: SYNC rate lowered from 200 to (\S+) Hz", printed)
@@ -71,18 +83,22 @@ force_n = [0.8]
 """
 
 
-def test_demo_reports_fault_of_scenario_and_leaves_no_files(tmp_path: Path) -> None:
+def test_demo_reports_fault_of_scenario_and_leaves_no_files(tmp_path: Path, host_starter: Starter) -> None:
     (tmp_path / "stuck.toml").write_text(STUCK)
-    home = {**os.environ, "HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path / "state")}
-    command = ["--seconds", "150", "--scenario", str(tmp_path / "stuck.toml")]
-    rest = _interrupted_at(r"right/ring_distal.*channel xa", *command, env=home)
+    home = {"HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path / "state")}
+    options = ["--plain", "--seconds", "150", "--scenario", str(tmp_path / "stuck.toml")]
+    with started(host_starter, *options, **home) as (demo, printed):
+        assert any(re.search(r"right/ring_distal.*channel xa", line) for line in printed)
+        demo.send_signal(signal.SIGINT)
+        rest = printed.read()
+        assert demo.wait(30) == 0
     assert re.search(r"^diagnosis: right/ring_distal: channel xa", rest, re.MULTILINE)
     assert "touches found" in rest
     assert not (tmp_path / "state").exists()
 
 
 @pytest.mark.parametrize("occupied", [False, True])
-def test_programs_beside_the_demo_receive_its_contacts(occupied: bool) -> None:
+def test_programs_beside_the_demo_receive_its_contacts(occupied: bool, host_starter: Starter) -> None:
     with socket.socket() as other:
         is_ours = False
         if occupied:
@@ -90,40 +106,32 @@ def test_programs_beside_the_demo_receive_its_contacts(occupied: bool) -> None:
                 other.bind(("127.0.0.1", 5580))
                 other.listen()
                 is_ours = True
-        command = [sys.executable, "-m", "handtouch", "demo", "--world", "ideal", "--plain"]
-        demo = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        with demo:
-            assert demo.stderr is not None
-            told = next(line for line in demo.stderr if "connect to this hand" in line)
+        with started(host_starter, "--world", "ideal", "--plain") as (demo, printed):
+            told = next(line for line in printed if "connect to this hand" in line)
             named = re.search(r"endpoint = (\S+)", told)
             assert named or not is_ours
             with handtouch.connect("contact/*/*", endpoint=named[1] if named else LIVE_ENDPOINT) as contacts:
                 contact = contacts.recv(60.0)
             demo.send_signal(signal.SIGINT)
-            demo.stderr.read()
+            printed.read()
     assert contact is not None
     assert contact.hand == "right"
 
 
-def _interrupted_at(
-    pattern: str, *options: str, env: dict[str, str] | None = None, stderr: TextIO | None = None
-) -> str:
-    """Interrupt a demo once a line matches `pattern`; return the rest of its output."""
-    command = [sys.executable, "-m", "handtouch", "demo", "--plain", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=env) as demo:
-        assert demo.stdout is not None
+def test_two_demos_run_concurrently(host_starter: Starter) -> None:
+    options = ["--world", "ideal", "--plain", "--seconds", "2"]
+    with started(host_starter, *options) as (one, _), started(host_starter, *options) as (other, _):
+        assert [one.wait(100), other.wait(100)] == [0, 0]
+
+
+@contextmanager
+def started(starter: Starter, *options: str, **environment: str) -> Iterator[tuple[Started, TextIO]]:
+    """Run `handtouch demo`, with its output; killed at the end of the block, if it still runs."""
+    reader, writer = os.pipe()
+    with open(reader) as printed:
+        with open(writer, "w") as output:
+            demo = starter.start(["demo", *options], output, **environment)
         try:
-            assert any(re.search(pattern, line) for line in demo.stdout)
-            demo.send_signal(signal.SIGINT)
-            rest = demo.stdout.read()
-            assert demo.wait(30) == 0
+            yield demo, printed
         finally:
             demo.kill()
-    return rest
-
-
-def test_two_demos_run_concurrently() -> None:
-    command = [sys.executable, "-m", "handtouch", "demo", "--world", "ideal", "--plain", "--seconds", "2"]
-    demos = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]
-    end_s = time.monotonic() + 100
-    assert [demo.wait(end_s - time.monotonic()) for demo in demos] == [0, 0]
