@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from handtouch.cli import build_parser, main
+from handtouch.cli import build_parser, main, requests
 from handtouch.cli.simulate import SCENARIOS
 from handtouch.config import shipped
 from tests.deployments import deployment_text, pad_text
@@ -112,6 +112,13 @@ def test_help_imports_no_heavy_package() -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.fixture
+def _short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait 0.2 s for a daemon that isn't there."""
+    monkeypatch.setattr(requests, "SHORT_TIMEOUT_S", 0.2)
+
+
+@pytest.mark.usefixtures("_short_wait")
 def test_status_without_a_daemon_exits_with_status_1_and_a_remedy(
     endpoints: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,6 +126,7 @@ def test_status_without_a_daemon_exits_with_status_1_and_a_remedy(
     assert "start `handtouch run FILE`" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("_short_wait")
 @pytest.mark.parametrize("way", ["option", "environment"])
 def test_a_client_command_finds_the_daemon_by_its_deployment_file(
     way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

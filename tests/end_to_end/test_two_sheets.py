@@ -1,6 +1,6 @@
 """Fingertips with two sheets on a bus: a subscriber sees force, radius and hardness of touches.
 
-Their nodes have channels of 16 bits in two TPDOs, or of 12 bits in one.
+The thumb's node has channels of 16 bits in two TPDOs, the finger's, of 12 bits in one.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from handtouch.config import shipped
 from handtouch.procedures.calibrate.daemon_pad import DaemonEndpoints, ServedPad
 from handtouch.simulate.truth import read_records
 
+MAX_COUNTS = {"thumb_tip": (1 << 15) - 1, "index_tip": (1 << 11) - 1}
 MIN_SAMPLES = 25
 """Valid radii of each fingertip to wait for."""
 PRESSED = """
@@ -41,46 +42,40 @@ hertz_force_n = 1.0
 """
 
 
-def _check_laws_and_currents(pressed: Any, max_count: int) -> None:
+def _check_laws_and_currents(pressed: Any, link: str) -> None:
     """Check what `calibrate` reads and sets of a second sheet."""
     ends = DaemonEndpoints(pressed.endpoints["live"], pressed.endpoints["control"], None)
-    with ServedPad(ends, "gripper", "thumb_tip", second_ampere_per_count=10e-3 / max_count) as pad:
+    with ServedPad(ends, "gripper", link, second_ampere_per_count=10e-3 / MAX_COUNTS[link]) as pad:
         currents = [sample.second_current_a for sample, _ in zip(pad.samples(), range(400), strict=False)]
     assert 1e-4 < np.nanmax(currents) < 5e-3
     law = {"contact_ohm_mm2": 41_000.0, "alpha": 1.01, "ohm_per_square": 610.0}
-    answer = client.request(
-        "calibrate", endpoint=ends.control, pad="thumb_tip", name="measured", second_law=law
-    )
+    answer = client.request("calibrate", endpoint=ends.control, pad=link, name="measured", second_law=law)
     assert answer["second_law"]["alpha"] == law["alpha"]
     assert answer["law"]["alpha"] == 1.5
 
 
-@pytest.fixture(params=[16, 12], ids=["16 bits", "12 bits"])
-def bits(request: pytest.FixtureRequest) -> int:
-    """Bits of a channel."""
-    return int(request.param)
-
-
 @pytest.fixture
-def pressed(rig: Any, bits: int) -> Any:
+def pressed(rig: Any) -> Any:
     """A daemon, and the nodes of two fingertips that are pressed again and again."""
     settings = "\n".join(f'{stream} = "{endpoint}"' for stream, endpoint in rig.endpoints.items())
     text = shipped.path("two_sheets.toml").read_text()
     text = text.replace("[daemon]\n", f"[daemon]\n{settings}\nsupervise = false\n", 1)
     text = text.replace("sync_period_ms = 10.0", "sync_period_ms = 20.0", 1)
     text = text.replace("noise_counts", "heartbeat_timeout_ms = 1000\nnoise_counts", 1)
-    if bits == 12:
-        text = re.sub(r'"(0x6401:\d)"', r'"\1:i12"', text)
-        eds = shipped.path("handtouch-node-12bit.eds")
-        text = text.replace("noise_counts = 1.0", f'eds = "{eds}"\nnoise_counts = 0.3', 1)
-    rig.config.write_text(text)
+    begin, end = text.index("[node."), text.index("[sheet.")
+    narrow = re.sub(r'"(0x6401:\d)"', r'"\1:i12"', text[begin:end].replace("five_channel", "narrow"))
+    eds = shipped.path("handtouch-node-12bit.eds")
+    narrow = narrow.replace("noise_counts = 1.0", f'eds = "{eds}"\nnoise_counts = 0.3', 1)
+    thumb, index = text[end:].split('link = "index_tip"')
+    index = index.replace('"five_channel"', '"narrow"', 1)
+    rig.config.write_text(f'{text[:end]}{narrow}{thumb}link = "index_tip"{index}')
     rig.scenario.write_text(PRESSED)
     rig.simulate("--world", "ideal", "--truth", str(rig.folder / "truth"))
     rig.start("run")
     return rig
 
 
-def test_a_subscriber_sees_force_radius_and_hardness_of_touches(pressed: Any, bits: int) -> None:
+def test_a_subscriber_sees_force_radius_and_hardness_of_touches(pressed: Any) -> None:
     found: dict[str, list[wire.Contact]] = {"thumb_tip": [], "index_tip": []}
     with pressed.subscribe("contact/*/*", "health/*/*", "percept/*/stiffness") as messages:
         health: dict[str, str] = {}
@@ -95,7 +90,8 @@ def test_a_subscriber_sees_force_radius_and_hardness_of_touches(pressed: Any, bi
                     felt = message
             elif message.contact_radius_status == "valid" and message.event == "update" and message.fresh:
                 found[message.link].append(message)
-    _check_laws_and_currents(pressed, (1 << bits - 1) - 1)
+    for link in found:
+        _check_laws_and_currents(pressed, link)
     assert pressed.end("simulate") == 0, pressed.all_printed()
     assert set(health.values()) <= {"operational", "no_zero"}
     # 3 F / (4 a^3), at 1 N and 3 mm
