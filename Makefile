@@ -94,7 +94,7 @@ timed: $(VENV)/.dev $(VENV)/.core
 
 computed: $(VENV)/.dev $(VENV)/.core
 	@{ nice -n 5 $(MAKE) --no-print-directory lint types docs && \
-	nice -n 10 $(BIN)/python -m pytest -q -m "not socketcan" $(COMPUTED) $(ARGS); } $(TO)
+	nice -n 10 $(MAKE) --no-print-directory unit ARGS="$(COMPUTED) $(ARGS)"; } $(TO)
 
 # for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
@@ -122,7 +122,7 @@ tables: $(VENV)/.dev ## write from the code what is generated of messages (docs/
 wiring: $(BIN)/python ## draw docs/wiring.svg, the wiring of a sensor node
 	$(BIN)/python docs/wiring.py >docs/wiring.svg
 
-# two workers for two processors: a third saves five minutes, but starves simulated nodes now and then
+# two workers for two processors: a third, unless it gives way, starves simulated nodes now and then
 unit: $(VENV)/.dev $(VENV)/.core ## run all tests that need no SocketCAN
 	$(BIN)/python -m pytest -m "not socketcan" -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 

@@ -264,11 +264,6 @@ def bench(tmp_path: Path, network: list[str], starter: Starter) -> Iterator[Benc
         made.end()
 
 
-@pytest.fixture(params=["lines", "dbc"])
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
 @pytest.fixture
 def sensor(kind: str, case: Case, bench: Bench, tmp_path: Path) -> Iterator[Sensor]:
     made: Sensor
@@ -303,7 +298,15 @@ def sensor(kind: str, case: Case, bench: Bench, tmp_path: Path) -> Iterator[Sens
 URDF_OF_SHIPPED = (("two_finger.urdf", str(shipped.path("two_finger.urdf"))),)
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.parametrize(
+    ("kind", "case"),
+    [
+        ("lines", CASES["four electrodes"]),
+        ("dbc", CASES["nine taxels"]),
+        pytest.param("lines", CASES["sixteen electrodes"], id="lines of sixteen"),
+    ],
+    ids=lambda value: getattr(value, "link", value),
+)
 def test_values_of_a_sensor_become_contacts_until_it_is_unplugged(
     sensor: Sensor, case: Case, bench: Bench
 ) -> None:

@@ -65,14 +65,6 @@ def test_contacts_of_a_recorded_session_are_within_the_noise_bound(
     assert summary.buses["can0"].wrong_length == 0
 
 
-def test_the_same_log_gives_identical_contacts_each_time(
-    session: tuple[list[Contact], LogReplaySummary], deployment: Deployment
-) -> None:
-    repeated: list[Contact] = []
-    replay_log(DATA / "session.log.gz", deployment, repeated.append)
-    assert repeated == session[0]
-
-
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc", ".csv"])
 def test_other_formats_of_python_can_give_the_same_contacts(
     session: tuple[list[Contact], LogReplaySummary], deployment: Deployment, tmp_path: Path, suffix: str
@@ -103,10 +95,13 @@ class _Publisher:
         self.sent.append(message)
 
 
-def test_a_published_log_says_twice_a_second_that_it_is_a_replay(deployment: Deployment) -> None:
-    """Without that, clients judge its frames by their own time, as old."""
-    publisher = _Publisher()
-    summary = replay_log(DATA / "session.log.gz", deployment, lambda _: None, publisher=publisher)
+def test_the_same_log_gives_identical_contacts_and_says_when_published_that_it_is_a_replay(
+    session: tuple[list[Contact], LogReplaySummary], deployment: Deployment
+) -> None:
+    """Twice a second: without that, clients judge its frames by their own time, as old."""
+    publisher, repeated = _Publisher(), list[Contact]()
+    summary = replay_log(DATA / "session.log.gz", deployment, repeated.append, publisher=publisher)
+    assert repeated == session[0]
     services = [message for message in publisher.sent if isinstance(message, wire.Service)]
     assert all(service.replay for service in services)
     assert len(services) == pytest.approx(2 * summary.log_s, abs=3)
@@ -196,22 +191,22 @@ def test_log_whose_stamps_do_not_advance_is_refused(deployment: Deployment, tmp_
     assert main(["replay", str(log), str(shipped.path("utah_mit.toml"))]) == 2
 
 
-@pytest.mark.parametrize(
-    ("back_s", "cause"), [(3600.0, "the clock was set"), (2**32 * 1e-6, "32 bits wrapped")]
-)
-def test_stamps_that_go_back_continue_with_a_warning(
-    deployment: Deployment, tmp_path: Path, back_s: float, cause: str
-) -> None:
+def _going_back(tmp_path: Path, back_s: float) -> Path:
+    return _rewritten(tmp_path, lambda number, stamp: stamp - back_s * (number > 2000))
+
+
+def test_stamps_that_go_back_continue_with_a_warning(deployment: Deployment, tmp_path: Path) -> None:
     whole: list[Contact] = []
     first = replay_log(_rewritten(tmp_path, lambda _, stamp: stamp), deployment, whole.append)
-    contacts: list[Contact] = []
-    log = _rewritten(tmp_path, lambda number, stamp: stamp - back_s * (number > 2000))
-    summary = replay_log(log, deployment, contacts.append)
-    (warning,) = summary.warnings
-    assert cause in warning
-    assert summary.log_s == pytest.approx(first.log_s, abs=0.1)
-    assert all(contact.duration_s >= 0 for contact in contacts)
-    assert [c.link for c in contacts if c.event == "begin"] == [c.link for c in whole if c.event == "begin"]
+    for back_s, cause in ((3600.0, "the clock was set"), (2**32 * 1e-6, "32 bits wrapped")):
+        contacts: list[Contact] = []
+        summary = replay_log(_going_back(tmp_path, back_s), deployment, contacts.append)
+        (warning,) = summary.warnings
+        assert cause in warning
+        assert summary.log_s == pytest.approx(first.log_s, abs=0.1)
+        assert all(contact.duration_s >= 0 for contact in contacts)
+        begun = [[c.link for c in some if c.event == "begin"] for some in (contacts, whole)]
+        assert begun[0] == begun[1]
 
 
 def test_frames_of_a_foreign_channel_belong_to_no_pad_where_the_log_has_the_buss(
