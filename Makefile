@@ -86,15 +86,15 @@ check: ## run lint, types and the fastest tests, as far as `make test` measured 
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types fastest
 
 # processes of tests wait for one another half of the time; what waits for nothing fills it, and gives way
-COMPUTED := $(addprefix tests/,calibration canbus config core design field percept sheet simulate supervisor wire)
+TIMED := $(addprefix tests/,bridge cli client daemon device end_to_end host node procedures view test_examples.py)
 .PHONY: timed computed
 timed: $(VENV)/.dev $(VENV)/.core
 	@$(MAKE) --no-print-directory socketcan
-	@$(MAKE) --no-print-directory unit ARGS="$(addprefix --ignore=,$(COMPUTED)) $(ARGS)"
+	@$(MAKE) --no-print-directory unit ARGS="$(TIMED) $(ARGS)"
 
 computed: $(VENV)/.dev $(VENV)/.core
 	@{ nice -n 5 $(MAKE) --no-print-directory lint types docs && \
-	nice -n 10 $(MAKE) --no-print-directory unit ARGS="$(COMPUTED) $(ARGS)"; } $(TO)
+	nice -n 10 $(MAKE) --no-print-directory unit ARGS="$(addprefix --ignore=,$(TIMED)) $(ARGS)"; } $(TO)
 
 # for the way between two edits; durations are those of the last `make test`
 fastest: $(VENV)/.dev $(VENV)/.core
