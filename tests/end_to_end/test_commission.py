@@ -218,7 +218,7 @@ def commission_in_terminal(rig: Any, presser: Presser, *arguments: str) -> tuple
 
 
 def test_randomly_wired_hand_is_commissioned_and_only_its_lines_change(rig: Any) -> None:
-    wrong, right = scramble(first_pads(rig.config.read_text(), 6), seed=1)
+    wrong, right = scramble(first_pads(rig.config.read_text(), 4), seed=3)
     rig.config.write_text(wrong)
     truth, folder = config.parse(right), rig.folder
     with pressed(rig, right) as presser:

@@ -24,7 +24,7 @@ from tests.deployments import deployment_text, pad_text
 from .conftest import run_in_threads
 from .served_daemon import MAX_WAIT_S, ServedDaemon
 
-PERIOD_MS = 10.0
+PERIOD_MS = 5.0
 MAX_GROWTH_BYTES = 32 << 20
 SCENARIO = """
 repeat = true
