@@ -345,36 +345,26 @@ def test_reboots_and_emergencies_are_reported(wire: VirtualBus) -> None:
     assert heading.index("EMCY") == row.index("0x3100 mains voltage")
 
 
-@pytest.mark.parametrize(
-    ("file", "objects", "names"),
-    [
-        ("feldmann-ai4w.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
-        ("noname-4ch.eds", [(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
-        ("norsens-quad404.eds", [(0x9130, sub) for sub in (1, 2, 3, 4)], ("0x9130:1", "0x9130:4")),
-        (
-            "tactor-q16.eds",
-            [(i, 0) for i in (0x2110, 0x2120, 0x2130, 0x2140)],
-            ("0x2110:0:i16", "0x2140:0:i16"),
-        ),
-        (
-            "ambit-f401.eds",
-            [(0x6403, sub) for sub in (1, 2, 3, 4)],
-            ("0x6403:1:f32/1000", "0x6403:4:f32/1000"),
-        ),
-    ],
-)
-def test_channels_of_other_vendors_nodes_are_found(
-    wire: VirtualBus, file: str, objects: list[tuple[int, int]], names: tuple[str, str]
-) -> None:
+VENDORS = {  # file: number and subs of objects, first and last name
+    "feldmann-ai4w.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+    "noname-4ch.eds": ([(0x6401, sub) for sub in (1, 2, 3, 4)], ("0x6401:1", "0x6401:4")),
+    "norsens-quad404.eds": ([(0x9130, sub) for sub in (1, 2, 3, 4)], ("0x9130:1", "0x9130:4")),
+    "tactor-q16.eds": ([(i, 0) for i in (0x2110, 0x2120, 0x2130, 0x2140)], ("0x2110:0:i16", "0x2140:0:i16")),
+    "ambit-f401.eds": ([(0x6403, sub) for sub in (1, 2, 3, 4)], ("0x6403:1:f32/1000", "0x6403:4:f32/1000")),
+}
+
+
+def test_channels_of_other_vendors_nodes_are_found(wire: VirtualBus) -> None:
     nodes = wire.nodes()
-    nodes.add(9, eds=Path(__file__).parents[1] / "data/eds" / file, channels=tuple(objects))
+    for node_id, (file, (objects, _)) in enumerate(VENDORS.items(), 9):
+        nodes.add(node_id, eds=Path(__file__).parents[1] / "data/eds" / file, channels=tuple(objects))
     nodes.start()
     (report,) = scan_buses([wire.bus], QUICK)
-    (node,) = report.nodes
-    found = channel_names(node)
-    assert (found[0], found[-1]) == names
-    (kind,) = config.parse(completed(fragment([(report.bus, report.nodes)]))).nodes.values()
-    assert kind.channels == found
+    for node, (_, names) in zip(report.nodes, VENDORS.values(), strict=True):
+        found = channel_names(node)
+        assert (found[0], found[-1]) == names
+        (kind,) = config.parse(completed(fragment([(report.bus, [node])]))).nodes.values()
+        assert kind.channels == found
 
 
 # Nodes that misbehave
@@ -448,21 +438,22 @@ def test_endless_sdo_transfer_does_not_block_the_scan(
     assert "no answer" in node.error
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_scan_ends_whatever_a_node_answers(wire: VirtualBus, seed: int) -> None:
-    chance = random.Random(seed)
+def test_scan_ends_whatever_nodes_answer(wire: VirtualBus) -> None:
+    def babbling(chance: random.Random) -> Callable[[bytes], bytes | None]:
+        def babble(request: bytes) -> bytes | None:
+            command = chance.choice((0x40, 0x41, 0x43, 0x4F, 0x00, 0x01, 0x10, 0x80, chance.getrandbits(8)))
+            return bytes((command,)) + request[1:4] + chance.randbytes(chance.choice((0, 4, 4, 4)))
 
-    def babble(request: bytes) -> bytes | None:
-        command = chance.choice((0x40, 0x41, 0x43, 0x4F, 0x00, 0x01, 0x10, 0x80, chance.getrandbits(8)))
-        return bytes((command,)) + request[1:4] + chance.randbytes(chance.choice((0, 4, 4, 4)))
+        return babble
 
-    end = answering(wire, 9, babble)
+    ends = [answering(wire, 9 + seed, babbling(random.Random(seed))) for seed in range(4)]
     try:
         reports = scan_buses([wire.bus], QUICK)
     finally:
-        end()
-    assert len(compare_nodes(None, reports)) == len(reports[0].nodes) <= 1
-    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1  # the node has stopped
+        for end in ends:
+            end()
+    assert len(compare_nodes(None, reports)) == len(reports[0].nodes) <= len(ends)
+    assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1  # the nodes have stopped
 
 
 # Nodes without a node id
