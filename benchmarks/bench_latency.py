@@ -5,13 +5,16 @@ by contacts at rest or sliding. The floor is a bare loop in place of the daemon:
 same frames with the same library, sends a message of the same size when the last has come, and computes
 nothing. Daemon and floor take turns, as ordinary processes, and where this user may have it, with real-time
 priority, the daemon then also with busy_poll_us. *To floor*: p50 and p99 over those of the floor it is
-compared with. *Stages*: means of the daemon's own histograms. SocketCAN is measured under
-`tests/socketcan/vcan-run`.
+compared with. *Stages*: means of the daemon's own histograms. *By rate*: a minute of each, sliding, as
+`make soak ONLY=cyclic` measures an hour. SocketCAN is measured under `tests/socketcan/vcan-run`.
 """
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -116,10 +119,12 @@ def serve_and_receive(
     endpoint: str,
     server: Callable[[Event], BaseProcess | subprocess.Popen[bytes]],
     seconds: float,
+    prepared: bool = False,
 ) -> Turn:
-    """Measure one pass with this server between nodes and a subscriber."""
+    """Measure one pass with this server between nodes, whose answers may be prepared, and a subscriber."""
     stamps, stop = multiprocessing.Array("q", 1 + MOST, lock=False), multiprocessing.Event()
-    worker = multiprocessing.Process(target=nodes, args=(config, samples, stamps, stop), daemon=True)
+    parameters = config, samples, stamps, stop, prepared
+    worker = multiprocessing.Process(target=nodes, args=parameters, daemon=True)
     worker.start()
     process = server(stop)
     control, figures, stages = load(config).daemon.control, {}, dict[str, float]()
@@ -153,11 +158,12 @@ def serve_and_receive(
     return Turn(np.array(known), last_frames_ns, {"CPU, %": 100 * share, **figures}, size, stages)
 
 
-def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float) -> Turn:
+def daemon_turn(config: Path, samples: NDArray[np.int64], seconds: float, prepared: bool = False) -> Turn:
     """Measure one pass of `handtouch run`."""
     command = [sys.executable, "-m", "handtouch", "run", str(config)]
     live = load(config).daemon.live
-    return serve_and_receive(config, samples, live, lambda _: subprocess.Popen(command), seconds)
+    server: Callable[[Event], subprocess.Popen[bytes]] = lambda _: subprocess.Popen(command)  # noqa: E731
+    return serve_and_receive(config, samples, live, server, seconds, prepared)
 
 
 def floor_turn(
@@ -218,6 +224,64 @@ def measure(report: Report, config: Path, turns: int, seconds: float) -> None:
     report.table("Stages of the loop, us a period", stages)
 
 
+RATES_HZ = 200, 1000
+PASS_SYNCS = 60_000
+"""SYNCs after which the daemon starts again: a pass keeps all messages in memory"""
+LATE_US = 5000.0
+_LATENESS = re.compile(r"^(\d+)[ \t]+(\d+)$", re.MULTILINE)
+
+
+def at_rate(folder: Path, rate_hz: int) -> Path:
+    """Write the shipped hand at a rate of SYNC, with real-time settings where this user may have them."""
+    config = on_loopback(folder, PORT)
+    period = f"sync_period_ms = {1e3 / rate_hz:g}\n"
+    text = re.sub(r"sync_period_ms = .*\n", period, config.read_text(), count=1)
+    options = "".join(f"{name} = {value}\n" for name, value in OPTIONS.items())
+    config.write_text(text.replace("[daemon]\n", f"[daemon]\n{options}"))
+    if realtime.check_realtime_settings(load(config).daemon):
+        config.write_text(text)
+    return config
+
+
+def distribution(rate_hz: int, seconds: float) -> list[dict[str, Any]]:
+    """Return rows of the daemon's latency at a rate of SYNC; and by `cyclictest`, where that is installed, of
+    the system's timers."""
+    turns, left_s = list[Turn](), seconds
+    while left_s > 0:
+        pass_s = min(left_s, PASS_SYNCS / rate_hz)
+        with tempfile.TemporaryDirectory(prefix="ht.") as folder:
+            config = at_rate(Path(folder), rate_hz)
+            turns.append(daemon_turn(config, film(load(config), PATHS["sliding"]), pass_s, prepared=True))
+        left_s -= pass_s
+        progress({"SYNCs/s": rate_hz, "left, s": left_s})
+    late_us = np.concatenate([turn.latencies_us() for turn in turns])
+    sums = {name: sum(turn.figures[name] for turn in turns) for name in SUMS if name != "ticks"}
+    rows = [{"SYNCs/s": rate_hz, "of": "last frame to subscriber", **_percentiles(late_us), **sums}]
+    if woken_us := cyclictest_us(rate_hz, seconds):
+        rows.append({"SYNCs/s": rate_hz, "of": "cyclictest", **_percentiles(np.array(woken_us))})
+    return rows
+
+
+def _percentiles(late_us: NDArray[np.float64]) -> dict[str, Any]:
+    names = ("p50, us", "p99, us", "99.9 %, us", "99.99 %, us", "worst, us")
+    shares = np.percentile(late_us, [50, 99, 99.9, 99.99, 100]).tolist()
+    late = 100 * float(np.mean(late_us > LATE_US))
+    return {"periods": len(late_us), **dict(zip(names, shares, strict=True)), "later than 5 ms, %": late}
+
+
+def cyclictest_us(rate_hz: int, seconds: float) -> list[float]:
+    """Return how late [us] `cyclictest` was woken in each period; nothing without it."""
+    program = shutil.which("cyclictest")
+    if program is None:
+        return []
+    period_us, most_us = round(1e6 / rate_hz), 100_000
+    command = [program, "--quiet", "--mlockall", f"--interval={period_us}", f"--histogram={most_us}"]
+    command += [f"--priority={PRIORITY}", f"--loops={round(seconds * rate_hz)}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = [(float(late), int(count)) for late, count in _LATENESS.findall(done.stdout)]
+    return list(itertools.chain.from_iterable(itertools.repeat(late, count) for late, count in found))
+
+
 def main() -> None:
     asked = asked_of(__doc__, seconds=6.0, turns=3, quick_s=0.5)
     if not VCAN.exists():
@@ -226,6 +290,8 @@ def main() -> None:
     report = Report(asked.quick, bus, passes=asked.turns, seconds_of_a_pass=asked.seconds)
     with tempfile.TemporaryDirectory(prefix="ht.") as folder:
         measure(report, on_loopback(Path(folder), PORT), asked.turns, asked.seconds)
+    minute_s = 1.0 if asked.quick else 60.0
+    report.table("By rate", [row for rate_hz in RATES_HZ for row in distribution(rate_hz, minute_s)])
     report.keep()
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.page import Rows, options, progress
 from handtouch import wire
 from handtouch.canbus.bus.load import frame_bits
+from handtouch.canbus.cia301 import SYNC
 from handtouch.config import Deployment, load, shipped
 from handtouch.device import DeviceBus
 from handtouch.simulate.scenario import Scenario
@@ -112,21 +113,47 @@ def film(deployment: Deployment, path: str, touched: Iterable[int] = range(TOUCH
     return np.concatenate([there, there[::-1]])
 
 
-def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event) -> None:
-    """Run the simulated nodes in a process; they repeat the samples."""
+def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event, prepared: bool = False) -> None:
+    """Run the simulated nodes in a process; they repeat the samples.
+
+    prepared: once they are operational they only answer SYNC, with frames made before, and send heartbeats.
+    """
     deployment = load(config)
     pads = [pad for hand in deployment.hands for pad in hand.pads]
     period_ns = round(deployment.daemon.sync_period_ms * 1e6)
     with open_bus() as bus:
-        devices = DeviceBus(
-            StampedBus(bus, 0x280 + pads[-1].node_id, stamps),  # type: ignore[arg-type]  # it quacks like one
-            lambda t_ns: samples[t_ns // period_ns % len(samples)],
-        )
-        for pad in pads:
-            devices.add(pad.node_id, serial=pad.serial)
+        stamped: Any = StampedBus(bus, 0x280 + pads[-1].node_id, stamps)
+        devices = DeviceBus(stamped, lambda t_ns: samples[t_ns // period_ns % len(samples)])
+        made = [devices.add(pad.node_id, serial=pad.serial) for pad in pads]
         devices.start()
-        stop.wait()
+        while prepared and not all(node.state == "OPERATIONAL" for node in made):
+            stop.wait(0.5)
+        if not prepared:
+            stop.wait()
         devices.stop()
+        if prepared:
+            answer(stamped, [pad.node_id for pad in pads], samples.astype("<i2"), stop)
+
+
+def answer(bus: can.BusABC, node_ids: list[int], samples: NDArray[np.int16], stop: Event) -> None:
+    """Answer SYNC with samples (k, nodes, 4), one after the other, and with a heartbeat of one node."""
+    frames = [
+        [_frame(0x280 + k, own.tobytes()) for k, own in zip(node_ids, row, strict=True)] for row in samples
+    ]
+    alive = [_frame(0x700 + node_id, b"\x05") for node_id in node_ids]
+    count = 0
+    while not stop.is_set():
+        message = bus.recv(0.1)
+        if message is None or message.arbitration_id != SYNC:
+            continue
+        for frame in frames[count % len(frames)]:
+            bus.send(frame)
+        bus.send(alive[count % len(alive)])
+        count += 1
+
+
+def _frame(can_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
 def receive(socket: zmq.Socket[bytes], seconds: float) -> list[tuple[list[bytes], int]]:
