@@ -32,7 +32,7 @@ from benchmarks.page import Report, options, progress
 from benchmarks.scores import Share
 from handtouch import wire
 from handtouch.config import load, shipped
-from handtouch.daemon.noise_report import NoiseReport
+from handtouch.daemon.pad_reports import NoiseReport
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch

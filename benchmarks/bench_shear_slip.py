@@ -27,8 +27,8 @@ from benchmarks.grasp_run import Served, drawn_world, served
 from benchmarks.scores import Estimates, EstimateScore, Rate, Share, bin_labels, concatenate, slices
 from handtouch.config import Deployment, load, shipped
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
+from handtouch.simulate.grasp.grasp_stimulus import pad_forces
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
-from handtouch.simulate.grasp.tangential import pad_forces
 
 FloatArray = NDArray[np.float64]
 KINDS: dict[str, tuple[str, ...]] = {

@@ -50,7 +50,7 @@ from handtouch import wire
 from handtouch.config import Deployment, load
 from handtouch.core.pad_model import PadModel
 from handtouch.core.stages.slip import INFORMATION
-from handtouch.daemon.noise_report import NoiseReport
+from handtouch.daemon.pad_reports import NoiseReport
 from handtouch.daemon.percepts import PerceptPublisher
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.virtual_hand import VirtualHand

@@ -32,9 +32,8 @@ from handtouch.hand.urdf import read_urdf
 from handtouch.host.units import GRAVITY_M_S2
 from handtouch.procedures.calibrate.fit import LawFit, fit_law
 from handtouch.procedures.calibrate.grasps import StaticGrasp, grasp_readings
-from handtouch.procedures.calibrate.readings import PadCircuitModel, Weight, WeightReading
+from handtouch.procedures.calibrate.readings import PadCircuitModel, Weight, WeightReading, with_responses
 from handtouch.procedures.calibrate.report import reported_force
-from handtouch.procedures.calibrate.response import with_responses
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand

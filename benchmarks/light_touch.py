@@ -23,8 +23,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import run_tick
 from handtouch.core.slab import CountSlab, Cycle
 from handtouch.core.tick import TickProcessor
-from handtouch.simulate.channel_errors import ChannelErrors
-from handtouch.simulate.electronics_drift import ElectronicsDrift
+from handtouch.simulate.electronics_drift import ChannelErrors, ElectronicsDrift
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand

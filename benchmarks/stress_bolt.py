@@ -42,9 +42,8 @@ from benchmarks.stale import measured_commit
 from handtouch.config import load, shipped
 from handtouch.hand.pads import mount_transform
 from handtouch.simulate.tactile.bolt_scene import BoltStart
-from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose, Sensed
+from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose, Sensed, ServedTouch
 from handtouch.simulate.tactile.reading import TactileReading
-from handtouch.simulate.tactile.served_touch import ServedTouch
 from handtouch.simulate.worlds import Family
 
 sys.path.insert(0, str(ROOT / "examples"))

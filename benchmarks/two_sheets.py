@@ -22,8 +22,8 @@ from handtouch.procedures.calibrate.readings import (
     WeightReading,
     measurement_order,
     parse_weights,
+    with_responses,
 )
-from handtouch.procedures.calibrate.response import with_responses
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
 from handtouch.simulate.virtual_hand import VirtualHand

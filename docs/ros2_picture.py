@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from handtouch.bridge.ros2 import messages as ros
 from handtouch.bridge.ros2.network import Quality, RosNetwork
 from handtouch.client import connect
-from handtouch.record.link_frames import ROOT_FRAME, LinkFrames
+from handtouch.record.foxglove import ROOT_FRAME, LinkFrames
 
 PICTURE = Path(__file__).parent / "ros2_markers.png"
 TOPIC = "handtouch/right/markers"

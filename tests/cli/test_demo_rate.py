@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from handtouch.cli.demo_rate import solving_time_s, sustained_period_ms
+from handtouch.cli.demo import solving_time_s, sustained_period_ms
 from handtouch.config import parse
 from handtouch.daemon.table_cache import build_pad_model
 from tests.deployments import SIX_ARCS, arcs_text

@@ -20,7 +20,7 @@ from handtouch.core.sheet_force import (
     sheet_behaviour_of,
 )
 from handtouch.core.state import TickState
-from handtouch.daemon.law_report import LawReport
+from handtouch.daemon.pad_reports import LawReport
 
 FloatArray = NDArray[np.float64]
 PERIOD_NS, DT_S = 100_000_000, 0.1

@@ -11,8 +11,7 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handtouch.daemon.authentication import Authenticator
-from handtouch.daemon.connection_limit import MAX_BURST, MAX_PER_S, ConnectionLimit
+from handtouch.daemon.authentication import MAX_BURST, MAX_PER_S, Authenticator, ConnectionLimit
 from handtouch.daemon.connections import dropped_connection_requests
 from handtouch.daemon.endpoints import bind_endpoint
 

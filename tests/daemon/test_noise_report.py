@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from handtouch.daemon.noise_report import NoiseReport
+from handtouch.daemon.pad_reports import NoiseReport
 from handtouch.wire.health import Diagnosis
 from tests.core.conftest import bench
 from tests.core.test_room import Room, hum, steady, touch

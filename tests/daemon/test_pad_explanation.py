@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.daemon.pad_explanation import explain_pad_state
+from handtouch.daemon.pad_reports import explain_pad_state
 from handtouch.wire import PadState
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import wire
-from handtouch.daemon.subscriptions import (
+from handtouch.daemon.publisher import (
     CHANGES_PER_S,
     MAX_CHANGES,
     MAX_UNKNOWN_PREFIXES,

@@ -15,7 +15,7 @@ from handtouch.cli.demo import in_process_deployment
 from handtouch.client import request
 from handtouch.config import Deployment, parse
 from handtouch.daemon.daemon import HandtouchDaemon
-from handtouch.host.process import process_statistics
+from handtouch.host.machine import process_statistics
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.simulated_hand import SimulatedHand
 from handtouch.simulate.worlds import WORLDS

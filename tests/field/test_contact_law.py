@@ -149,11 +149,13 @@ class TestLaw:
 
     @pytest.mark.parametrize("hertz", [None, 1.0])
     def test_many_contacts_equal_single_ones(self, hertz: float | None) -> None:
-        law = ContactLaw([1e-2, 2e-2, 3e-2], 1.5, [2e-3, 3e-3, 1e-3], [0.0, 1e-4, 2e-4], hertz_n=hertz)
+        ohm, radius, std = [1e-2, 2e-2, 3e-2], [2e-3, 3e-3, 1e-3], [0.0, 1e-4, 2e-4]
+        law = ContactLaw(ohm, 1.5, radius, std, hertz_n=hertz)
         current = np.array([1e-3, 2e-3, 5e-4])
         together = estimate_force(law, current, current_std_a=1e-5)
         for i in range(3):
-            alone = estimate_force(law.select(np.array([i])), current[[i]], current_std_a=1e-5)
+            single = ContactLaw([ohm[i]], 1.5, [radius[i]], [std[i]], hertz_n=hertz)
+            alone = estimate_force(single, current[[i]], current_std_a=1e-5)
             assert alone.force_n[0] == together.force_n[i]
             assert alone.std_n[0] == together.std_n[i]
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from handtouch.host.redaction import redact
+from handtouch.cli.support import redact
 
 PLANTED = "hunter2-Zx9"
 

@@ -36,8 +36,8 @@ from handtouch.record.foxglove import (
     LOG_TOPIC,
     SCENE_TOPIC,
     FoxgloveConverter,
+    quaternion,
 )
-from handtouch.record.link_frames import quaternion
 from handtouch.record.schemas import SceneMessage
 from handtouch.view import foxglove as live
 from handtouch.wire import to_map

@@ -19,8 +19,8 @@ from handtouch.daemon.sampling import SamplingController
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.daemon.tare import TareJob
 from handtouch.record.exact_replay import ExactReplay
+from handtouch.record.export import rows_of
 from handtouch.record.recording import Recording
-from handtouch.record.tables import rows_of
 from tests.core.shear_bench import LAYOUT, ShearBench, shear_deployment
 from tests.record.conftest import PERIOD_NS, SESSION, CollectingSink, Hand, RecordingSession
 

@@ -12,9 +12,8 @@ import pytest
 
 from handtouch.cli import main
 from handtouch.record import plot
-from handtouch.record.export import find_columns
+from handtouch.record.export import Row, component_names, find_columns, flatten_payload, pad_state_name
 from handtouch.record.recording import Recording
-from handtouch.record.tables import Row, component_names, flatten_payload, pad_state_name
 
 pyarrow = pytest.importorskip("pyarrow")
 

@@ -25,11 +25,10 @@ from handtouch.hand.robot_models import RobotModels
 from handtouch.simulate import grasp as grasping
 from handtouch.simulate.contact_patch import ContactPatch
 from handtouch.simulate.grasp.grasp_objects import GRASP_OBJECTS
-from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus
+from handtouch.simulate.grasp.grasp_stimulus import EncoderErrors, GraspStimulus, pad_forces
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S, MujocoPad, MujocoScene
 from handtouch.simulate.grasp.patches import ContactPatches, clip_to_pad, contact_patches
 from handtouch.simulate.grasp.simulation import GraspRecord, hand_contacts, simulate_grasp
-from handtouch.simulate.grasp.tangential import pad_forces
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, ElectronicsSpread, Fixed, World

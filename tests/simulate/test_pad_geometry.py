@@ -7,10 +7,10 @@ import pytest
 
 from handtouch.config import SurfaceTable
 from handtouch.field.surface_base import SURFACES
+from handtouch.simulate.coarse_sheet import cut_sheet_maps
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.sheet_solver import ElectrodeGaps, SheetMaps
 from handtouch.simulate.surfaces import simulated_surface
-from handtouch.simulate.torn_sheet import cut_sheet_maps
 from tests.simulate.surfaces import MESH_TABLE, OUTLINE_TABLES, SURFACE_TABLES
 
 POSITIONS = [(0.0, 0.0), (0.5, 0.5), (0.02, 0.9), (0.7, 0.3), (1.0, 1.0)]

@@ -12,8 +12,7 @@ from handtouch.config.shear import Shear
 from handtouch.field.elastic_layer import ElasticLayer
 from handtouch.field.shear import overlap_ratio
 from handtouch.field.shear_estimate import ShearPad
-from handtouch.simulate.shear_film import Plates, solve_section
-from handtouch.simulate.shear_pad import LayerHistory, SimulatedShearPad
+from handtouch.simulate.shear_pad import LayerHistory, Plates, SimulatedShearPad, solve_section
 from handtouch.simulate.worlds import WORLDS
 
 BARS = {"bars": 2, "pitch_mm": 3.4, "overlap_mm": 0.6, "length_mm": 6.0, "gap_mm": 0.4}

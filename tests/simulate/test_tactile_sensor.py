@@ -15,8 +15,8 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate import TactileReading, TactileSensor
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
-from handtouch.simulate.tactile.live_sheet import LiveSheets
 from handtouch.simulate.tactile.mujoco_contacts import ContactReader
+from handtouch.simulate.tactile.simulated_pads import LiveSheets
 from handtouch.simulate.worlds import SHEET_KINDS, PartSpread, Uniform, World
 from handtouch.wire import ForceStatus, PadState, PositionStatus
 

@@ -14,10 +14,10 @@ from handtouch import config
 from handtouch.field import ElectrodeNetwork
 from handtouch.field.contact_law import contact_stack_resistance
 from handtouch.field.uneven_sheet import UNEVEN_WAVES, unevenness_slopes
+from handtouch.simulate.coarse_sheet import uneven_sheet_maps
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.sheet_solver import TABLE_NODES, ElectrodeGaps, solve_sheet
 from handtouch.simulate.surfaces import simulated_surface
-from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import UNEVEN_MODES, ElectronicsSpread, Fixed, PartSpread, World

@@ -27,7 +27,7 @@ from handtouch.calibration.calibration import (
 from handtouch.calibration.store import Store
 from handtouch.calibration.store_client import MountingPoint, StoreClient
 from handtouch.config import NamedPad
-from handtouch.procedures.calibrate.new_sheet import store_new_sheet
+from handtouch.procedures.calibrate.store_law import store_new_sheet
 from handtouch.sheet import S1, BankPrior, BankState, ModelBank
 from handtouch.supervisor.ipc import (
     CalibrationAssessment,

@@ -33,9 +33,8 @@ from handtouch.field.triangulation import parse_stl
 from handtouch.hand import mount_transform, pad_surface
 from handtouch.hand.kinematics import HandKinematics
 from handtouch.hand.urdf import BodyShape, read_urdf
-from handtouch.view.page.meshes import body_mesh, outline_m, pad_mesh
 from handtouch.view.page.model import PageModel, VersionedValues
-from handtouch.view.page.scene_graph import scene_of
+from handtouch.view.page.scene_graph import body_mesh, outline_m, pad_mesh, scene_of
 from handtouch.view.page.server import PageServer
 from tests.view.test_terminal import SERVICE
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -124,8 +125,7 @@ def _add_store(parser: argparse.ArgumentParser) -> None:
 
 def run_list(store: Path | None, deployment: Path | None, as_json: bool) -> int:
     """List every sensor; exit status 0, 1 (damaged stores exist beside it), 2 (no store)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment) as opened:
         newest, damaged = opened.newest_of_all(), damaged_files(opened.path)
         if as_json:
             sensors = [{"versions": one.number, "newest": _summary_fields(one)} for one in newest]
@@ -146,15 +146,12 @@ def run_list(store: Path | None, deployment: Path | None, as_json: bool) -> int:
             print(f"{path}: a damaged store; delete it once its content isn't needed", file=sys.stderr)
         return 1 if damaged else 0
 
-    return _run_with_store(store, deployment, action)
-
 
 def run_show(
     store: Path | None, deployment: Path | None, sensor: str, number: int | None, as_json: bool
 ) -> int:
     """Show versions of a sensor; exit status 0, or 2 (no such version)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment) as opened:
         version = exchange.find_version(opened, sensor, number)
         if as_json:
             print_json(version.to_json())
@@ -163,8 +160,6 @@ def run_show(
                 print(f"{'>' if old == version else ' '} {_summary_line(old)}")
             _print_version(version)
         return 0
-
-    return _run_with_store(store, deployment, action)
 
 
 def run_diff(
@@ -176,8 +171,7 @@ def run_diff(
     as_json: bool,
 ) -> int:
     """Compare two versions; exit status 0 (equal), 1 (different), 2 (no such version)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment) as opened:
         new = exchange.find_version(opened, sensor, after)
         old = opened.get(new.serial, max(new.number - 1, 1) if before is None else before)
         rows: list[tuple[str, Any, Any]] = list(differences(old.calibration, new.calibration))
@@ -192,15 +186,12 @@ def run_diff(
             print(f"{name}\n  - {_format_value(one)}\n  + {_format_value(other)}")
         return 1 if rows else 0
 
-    return _run_with_store(store, deployment, action)
-
 
 def run_roll_back(
     store: Path | None, deployment: Path | None, sensor: str, number: int, as_json: bool
 ) -> int:
     """Write an older version again; exit status 0, or 2 (no such version)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment) as opened:
         made = exchange.roll_back(opened, sensor, number, datetime.now(UTC))
         if as_json:
             print_json(_summary_fields(made))
@@ -209,15 +200,12 @@ def run_roll_back(
         print(_APPLIED_NOTE)
         return 0
 
-    return _run_with_store(store, deployment, action)
-
 
 def run_export(
     store: Path | None, deployment: Path | None, sensors: Sequence[str], history: bool, out: Path | None
 ) -> int:
     """Export calibrations as JSON; exit status 0, or 2 (no such sensor, or the file can't be written)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment) as opened:
         newest = [exchange.find_version(opened, sensor) for sensor in sensors] or opened.newest_of_all()
         versions = [
             version for one in newest for version in (opened.versions(one.serial) if history else [one])
@@ -232,8 +220,6 @@ def run_export(
         print(f"wrote {len(versions)} calibrations to {out}")
         return 0
 
-    return _run_with_store(store, deployment, action)
-
 
 def run_import(
     store: Path | None,
@@ -244,8 +230,7 @@ def run_import(
     as_json: bool,
 ) -> int:
     """Import exported calibrations; exit status 0, or 2 (no export, or another sensor's)."""
-
-    def action(opened: Store) -> int:
+    with _opened_store(store, deployment, create=True) as opened:
         versions = exchange.import_versions(
             opened, file, serial, accept_mismatch=other_sensor, now=datetime.now(UTC)
         )
@@ -258,18 +243,15 @@ def run_import(
         print(_APPLIED_NOTE)
         return 0
 
-    return _run_with_store(store, deployment, action, create=True)
 
-
-def _run_with_store(
-    store: Path | None, deployment: Path | None, action: Callable[[Store], int], create: bool = False
-) -> int:
+@contextmanager
+def _opened_store(store: Path | None, deployment: Path | None, create: bool = False) -> Iterator[Store]:
+    """Open a store by its path or its deployment file, by default the user's."""
     if store is None:
         loaded = None if deployment is None else config.load(deployment)
-        beside = None if deployment is None else deployment.parent
-        store = store_path(loaded, beside)
+        store = store_path(loaded, None if deployment is None else deployment.parent)
     with Store(store, create=create) as opened:
-        return action(opened)
+        yield opened
 
 
 def _print_version(version: CalibrationVersion) -> None:

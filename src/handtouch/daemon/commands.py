@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from handtouch import wire
 from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LawParameters
@@ -27,7 +27,6 @@ from handtouch.core.events import BaselineEvent, EvidenceEvent
 from handtouch.core.pad_patterns import PATTERNS_PER_PAD
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import Demand, scaled_limit
-from handtouch.daemon.arguments import parse_arguments
 from handtouch.daemon.control import (
     MAX_REPLY_BYTES,
     Command,
@@ -35,6 +34,7 @@ from handtouch.daemon.control import (
     JobCommand,
     RefusedError,
     Reply,
+    format_value,
 )
 from handtouch.daemon.percept_client import known_object
 from handtouch.daemon.reload import DeploymentChange, ReloadJob
@@ -407,3 +407,53 @@ def _check_base_scene(request: _SceneArguments) -> None:
             "links = [] would switch off every pad until reset; to switch pads off, send disable with "
             'pads = ["*"]; for a scene of your own add name = "NAME" and lease_s'
         )
+
+
+_MAX_PROBLEMS = 5
+_TEXTS = {
+    "missing": "is missing",
+    "extra_forbidden": "unknown argument",
+    "tuple_type": "must be an array",
+    "list_type": "must be an array",
+    "string_type": "must be a string",
+    "bool_type": "must be true or false",
+    "int_type": "must be an integer",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "model_type": "must be an object",
+    "model_attributes_type": "must be an object",
+    "dict_type": "must be an object",
+    "too_short": "must have at least {min_length} elements",
+    "too_long": "must have at most {max_length} elements",
+    "string_too_short": "must have at least {min_length} characters",
+    "string_too_long": "must have at most {max_length} characters",
+    "string_pattern_mismatch": "must match {pattern}",
+    "literal_error": "must be {expected}",
+    "enum": "must be {expected}",
+    "greater_than": "must be greater than {gt:g}",
+    "greater_than_equal": "must be at least {ge:g}",
+    "less_than": "must be less than {lt:g}",
+    "less_than_equal": "must be at most {le:g}",
+}
+"""pydantic error type -> text, with the values of its context"""
+
+_T = TypeVar("_T", bound=Table)
+
+
+def parse_arguments(kind: type[_T], arguments: dict[str, Any]) -> _T:
+    """Return the arguments as a table of the given kind. Raises RefusedError naming every mistake."""
+    try:
+        return kind.model_validate(arguments)
+    except ValidationError as error:
+        known = ", ".join(kind.model_fields) or "none"
+        problems = [_describe(dict(item)) for item in error.errors(include_url=False)[:_MAX_PROBLEMS]]
+        raise RefusedError("; ".join(problems) + f" (arguments: {known})") from error
+
+
+def _describe(error: dict[str, Any]) -> str:
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in error["loc"]).lstrip(".")
+    known = _TEXTS.get(error["type"])
+    text = error["msg"] if known is None else known.format(**error.get("ctx", {})).replace("'", '"')
+    return (
+        f"{key} {text}" if error["type"] == "missing" else f"{key} = {format_value(error['input'])}: {text}"
+    )

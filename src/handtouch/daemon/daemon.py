@@ -61,7 +61,7 @@ from handtouch.hand.robot_models import RobotModels
 from handtouch.host.build import build_info
 from handtouch.host.closing import Closing
 from handtouch.host.installation import compile_command
-from handtouch.host.process import process_statistics
+from handtouch.host.machine import process_statistics
 
 _log = logging.getLogger("handtouch.daemon")
 

@@ -27,9 +27,7 @@ from handtouch.config import Deployment
 from handtouch.core.compiled import Compilation
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.stages.rows import SHEAR_CHANNELS
-from handtouch.daemon.law_report import LawReport
-from handtouch.daemon.noise_report import NoiseReport
-from handtouch.daemon.pad_explanation import explain_pad_state
+from handtouch.daemon.pad_reports import LawReport, NoiseReport, explain_pad_state
 from handtouch.daemon.percept_client import PerceptClient
 from handtouch.daemon.publisher import Publisher
 from handtouch.daemon.shear_channels import ShearChannels

@@ -18,10 +18,10 @@ from handtouch.design.goals import PAIR_SCORE, Goal, line_errors, misfit_weights
 from handtouch.design.layout import ElectrodeLayout
 from handtouch.design.pad_task import PadTask
 from handtouch.design.response import ContactResponse, contact_response
+from handtouch.simulate.coarse_sheet import uneven_sheet_maps
 from handtouch.simulate.sheet_circuit import SheetCircuit, Wiring
 from handtouch.simulate.sheet_solver import SheetMapBank
 from handtouch.simulate.surfaces import simulated_surface
-from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_pad import true_gaps
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, Family, World

@@ -126,13 +126,6 @@ class ContactLaw:
         if self.hertz_n is not None and np.ptp(np.asarray(self.alpha, np.float64)) > 0:
             raise ValueError("alpha must be one number where hertz_n is given")
 
-    def select(self, index: npt.NDArray[np.intp]) -> ContactLaw:
-        """Return the law of some of the contacts; costs microseconds, because nothing is checked again."""
-        law = object.__new__(ContactLaw)
-        taken = {name: _select_column(getattr(self, name), index) for name in _LAW_COLUMNS}
-        law.__dict__.update(taken, hertz_n=self.hertz_n, _terms=self._terms.select(index))
-        return law
-
     @np.errstate(all="ignore")
     def radius(self, force_n: npt.ArrayLike) -> FloatArray:
         """Return the radius of the contact [m] at a force [N]."""
@@ -287,17 +280,5 @@ class _LogLawTerms(NamedTuple):
     radius_weight: FloatArray
     direct_weight: FloatArray
 
-    def select(self, index: npt.NDArray[np.intp]) -> _LogLawTerms:
-        return _LogLawTerms(
-            _select_column(self.power, index),
-            self.growth,
-            *(_select_column(column, index) for column in self[2:]),
-        )
-
 
 _LAW_COLUMNS = ("contact_ohm_m2", "alpha", "radius_m", "radius_std_m", "reference_pa")
-
-
-def _select_column(column: npt.ArrayLike, index: npt.NDArray[np.intp]) -> FloatArray:
-    column = np.asarray(column, np.float64)
-    return column.take(index) if column.ndim else column

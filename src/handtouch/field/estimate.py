@@ -56,11 +56,6 @@ class PointEstimate:
     covariance: FloatArray
     converged: BoolArray
 
-    def assign(self, index: NDArray[np.intp], other: PointEstimate) -> None:
-        """Overwrite some of the elements of arrays (n,)."""
-        for name in self.__dataclass_fields__:
-            getattr(self, name)[index] = getattr(other, name)
-
 
 def estimate(
     model: ForwardModel, currents: ArrayLike, noise: ArrayLike, start: ArrayLike | None = None

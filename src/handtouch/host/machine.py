@@ -1,18 +1,24 @@
-"""Facts about this machine: kernel parameters, network interfaces and routes.
+"""Facts about this machine and this process: kernel parameters, network, routes, resources in use.
 
-Public names: `Machine`, `check_multicast_route`, `NoRouteError`.
+Public names: `Machine`, `check_multicast_route`, `NoRouteError`, `process_statistics` (for `service`).
 """
 
 from __future__ import annotations
 
 import errno
+import gc
 import json
+import logging
+import os
 import re
 import socket
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from handtouch.host.logs import BoundedLogHandler
 
 _NET_ADMIN_BIT = 12
 _ANY_PORT = 9
@@ -106,3 +112,22 @@ class Machine:
             return False
         found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
         return found is not None and bool(int(found[1], 16) >> _NET_ADMIN_BIT & 1)
+
+
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+
+
+def process_statistics() -> dict[str, Any]:
+    """Return memory, CPU time (`loop_cpu_s`: of the calling thread), collections and lost log messages."""
+    with open("/proc/self/statm", "rb") as statm:
+        resident_pages = int(statm.read().split()[1])
+    handlers = logging.getLogger().handlers
+    log = next((handler for handler in handlers if isinstance(handler, BoundedLogHandler)), None)
+    return {
+        "memory_bytes": resident_pages * _PAGE_BYTES,
+        "cpu_s": time.process_time(),
+        "loop_cpu_s": time.thread_time(),
+        "collections": [generation["collections"] for generation in gc.get_stats()],
+        "log_dropped": log.dropped if log else 0,
+        "log_suppressed": log.suppressed if log else 0,
+    }

@@ -21,14 +21,26 @@ from handtouch.config.base import MAX_CHANNELS, MIN_CHANNELS, Name, OneOfKinds, 
 from handtouch.config.problems import ConfigError, Problem, Tables, problems_of
 from handtouch.config.tables import NodeId
 from handtouch.config.toml_text import parse_toml, read_text
+from handtouch.host.plugins import load_plugins
+from handtouch.node.dbc import DbcSource
+from handtouch.node.lines import LinesSource
 from handtouch.node.source import Source
-from handtouch.node.source_kinds import source_kinds
 
 _IIO_CHANNEL = re.compile(r"(voltage|current)\d+(-(voltage|current)\d+)?")
 Channel = Annotated[str, Field(min_length=1, max_length=200)]
 PadChannels = Annotated[
     tuple[Channel, ...], Field(strict=False, min_length=MIN_CHANNELS, max_length=MAX_CHANNELS)
 ]
+
+
+def source_kinds() -> dict[str, type[Source]]:
+    """Return the kinds of sources by name: handtouch's own, and those of entry points.
+
+    Raises PluginError for an entry point that is no subclass of `Source`, naming its package.
+    """
+    return {"lines": LinesSource, "dbc": DbcSource, **load_plugins("handtouch.sources", Source)}
+
+
 KINDS: Mapping[str, Tables] = {"source": source_kinds()}
 """Models of tables that follow one of several, by `kind`"""
 AnySource = Annotated[Source, OneOfKinds(KINDS["source"])]

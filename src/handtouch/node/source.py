@@ -1,7 +1,7 @@
 """Sources of a pad's values that aren't ADCs of this computer: tables `[source.NAME]`, each of a `kind`.
 
 Public names: `Source`, `SourceReader` (base of their readers). The kinds are found by
-`handtouch.node.source_kinds`.
+`handtouch.node.settings`.
 """
 
 from __future__ import annotations

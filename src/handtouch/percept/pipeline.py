@@ -7,19 +7,20 @@ Public name: `PerceptPipeline`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.arrays import FloatArray, IntArray
-from handtouch.percept.action_request import ActionRequest, ActionSelector, Question
+from handtouch.percept.action_request import ActionRequest, ActionSelector, CandidateAction, Question
 from handtouch.percept.estimator import HandSnapshot, PerceptEstimator
-from handtouch.percept.friction_estimator import FrictionEstimator
+from handtouch.percept.friction import FrictionEstimator
 from handtouch.percept.object_estimator import ObjectEstimator
+from handtouch.percept.relative_motion import slip_probability
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate
 from handtouch.percept.shape import PairDistanceFunction, ShapeEstimator
-from handtouch.percept.slip_questions import slip_questions
 from handtouch.percept.stiffness_estimator import ExpectedRadius, StiffnessEstimator
 from handtouch.wire import PERCEPT_KINDS
 
@@ -152,3 +153,33 @@ class PerceptPipeline:
     def _is_requested(self, question: Question) -> bool:
         pads = self.buffer.hand_index == question.hand if question.pad < 0 else question.pad
         return bool(np.any(self.action_request_pads[pads]))
+
+
+_MIN_LOG_ODDS = math.log(0.25)  # ln of the odds of slip above which a question is posed
+_HOLD_S = 0.5
+
+
+def slip_questions(buffer: ContactBuffer, requested: NDArray[np.bool_]) -> list[Question]:
+    """Return a question for each contact on the requested pads (n,) that may slip and isn't known to."""
+    pads = np.flatnonzero(requested & (buffer.contact_id > 0))
+    log_odds = buffer.latest_field(pads, "slip_log_odds")
+    uncertain = (log_odds > _MIN_LOG_ODDS) & np.isfinite(log_odds)
+    return [
+        _slip_question(buffer, pad, slip_probability(odds))
+        for pad, odds in zip(pads[uncertain].tolist(), log_odds[uncertain].tolist(), strict=True)
+    ]
+
+
+def _slip_question(buffer: ContactBuffer, pad: int, slips: float) -> Question:
+    tremor_m, velocity = (
+        buffer.latest_field(np.array([pad]), name)[0] for name in ("tremor_std_m", "slip_velocity_m_per_s")
+    )
+    tremor, ramp = float(np.hypot(*tremor_m)), _HOLD_S * float(np.hypot(*velocity))
+    hold = CandidateAction(
+        "hold",
+        {"duration_s": _HOLD_S},
+        {"sticks": (0.0, tremor), "slides": (ramp, math.hypot(tremor, ramp / 2))},
+        outcome_name="further displacement of the centroid in m",
+    )
+    hand, contact = int(buffer.hand_index[pad]), int(buffer.contact_id[pad])
+    return Question("slip", hand, pad, contact, {"sticks": 1 - slips, "slides": slips}, [hold])

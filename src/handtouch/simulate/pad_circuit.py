@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.arrays import FloatArray
+from handtouch.simulate.coarse_sheet import cut_sheet_maps, is_beyond_cut
 from handtouch.simulate.contact_patch import discs
 from handtouch.simulate.faults import Fault, FaultContacts
 from handtouch.simulate.mesh_geometry import SimulatedMesh
@@ -38,7 +39,6 @@ from handtouch.simulate.sheet_solver import (
 )
 from handtouch.simulate.solved_contact import ContactLayer, PatchNodes, look_up_nodes, solve_patches
 from handtouch.simulate.stimulus import PadStimulus
-from handtouch.simulate.torn_sheet import cut_sheet_maps, is_beyond_cut
 from handtouch.simulate.unevenness import Unevenness
 
 _MAX_BATCHED_TIMES = 20

@@ -28,8 +28,7 @@ from handtouch.hand.urdf import RobotDescription
 from handtouch.simulate.base_motion import base_pose
 from handtouch.simulate.gripper import GripperStimulus
 from handtouch.simulate.gripper_service import GripperService
-from handtouch.simulate.joint_feed import JointFeed
-from handtouch.simulate.joints import ReportedJoints
+from handtouch.simulate.joints import JointFeed, ReportedJoints
 from handtouch.simulate.stimulus import JointTrajectory, Stimulus
 from handtouch.simulate.truth import GroundTruth, TouchCounter
 from handtouch.simulate.virtual_hand import VirtualHand

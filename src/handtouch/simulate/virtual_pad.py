@@ -21,8 +21,8 @@ from handtouch.config.responses import TwoLayersTable
 from handtouch.config.roles import ELECTRODE, SECOND_SHEET, channel_numbers
 from handtouch.hand.pads import mount_transform
 from handtouch.simulate import noise
-from handtouch.simulate.channel_errors import ChannelErrors
-from handtouch.simulate.electronics_drift import ElectronicsDrift
+from handtouch.simulate.coarse_sheet import uneven_sheet_maps
+from handtouch.simulate.electronics_drift import ChannelErrors, ElectronicsDrift
 from handtouch.simulate.faults import (
     Fault,
     Gum,
@@ -44,7 +44,6 @@ from handtouch.simulate.skin import FieldLoad, SkinLoad, link_motion
 from handtouch.simulate.stimulus import NodeReplacement, PadStimulus, Stimulus
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.two_layers import two_layer_circuit
-from handtouch.simulate.uneven_sheet import uneven_sheet_maps
 from handtouch.simulate.unevenness import Unevenness
 from handtouch.simulate.virtual_shear import VirtualShear
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad

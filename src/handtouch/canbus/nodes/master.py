@@ -42,15 +42,17 @@ from handtouch.canbus.nodes.lifecycle_types import (
     TimerExpired,
 )
 from handtouch.canbus.nodes.managed_node import (
+    NMT_COMMAND,
     NMT_COMMANDS,
+    UNKNOWN_SENDER,
     ManagedNode,
     StepOutcome,
     StepResult,
+    find_owners,
     make_managed_node,
     run_step,
     send_nmt,
 )
-from handtouch.canbus.nodes.owners import NMT_COMMAND, UNKNOWN_SENDER, find_owners
 from handtouch.canbus.nodes.sample_rates import SampleRates
 from handtouch.canbus.nodes.spec import (
     ErrorChanged,

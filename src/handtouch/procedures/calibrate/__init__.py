@@ -2,9 +2,9 @@
 
 Public: `CalibrateOptions`, `DaemonEndpoints`, `CalibrationError`; `run_guided` and `refit_recording`, which
 return a `CalibrationResult`; `fit_grasps`; `set_new_sheet`, `find_pad`. `procedure` is the dialogue,
-`daemon_pad` the pad of a running daemon, `response` what the sheet's behaviour leaves of a weight, `fit` the
-law, `report` and `plot` its description, `recording` the file of readings, `grasps` the forces of static
-grasps, `store_law` and `new_sheet` what is stored; `press_map` the map of positions.
+`daemon_pad` the pad of a running daemon, `readings` what is read of a weight, `fit` the law, `report` and
+`plot` its description, `recording` the file of readings, `grasps` the forces of static grasps, `store_law`
+what is stored; `press_map` the map of positions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from handtouch.procedures.calibrate import plot, report
 from handtouch.procedures.calibrate.daemon_pad import DaemonEndpoints, ServedPad
 from handtouch.procedures.calibrate.fit import SheetReadings, fit_laws
 from handtouch.procedures.calibrate.grasps import grasp_readings, read_grasps
-from handtouch.procedures.calibrate.new_sheet import store_new_sheet
 from handtouch.procedures.calibrate.procedure import WeightProcedure
 from handtouch.procedures.calibrate.readings import (
     ContactCircuit,
@@ -35,10 +34,10 @@ from handtouch.procedures.calibrate.readings import (
     WeightReading,
     measurement_order,
     parse_weights,
+    with_responses,
 )
 from handtouch.procedures.calibrate.recording import ReadingRecorder, RecordingHeader, read_recording
-from handtouch.procedures.calibrate.response import with_responses
-from handtouch.procedures.calibrate.store_law import store_law
+from handtouch.procedures.calibrate.store_law import store_law, store_new_sheet
 from handtouch.procedures.dialogue import Dialogue, open_dialogue
 
 __all__ = [

@@ -1,7 +1,8 @@
-"""Known weights, readings of them, and the circuit around each contact.
+"""Known weights, readings of them, the circuit around each contact, and what the sheet's behaviour leaves.
 
 Public names: `Weight`, `parse_weights`, `measurement_order`, `WeightReading`, `ContactCircuit`,
-`circuit_at`.
+`PadCircuitModel`, `with_responses`. The core compensates creep, adaptation and hysteresis in every force, so
+a law is fitted to the loads that it takes for uncompensated.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ import numpy as np
 from handtouch import config
 from handtouch.config.roles import SECOND_SHEET, channel_numbers
 from handtouch.core.pad_model import channel_ampere_per_count
+from handtouch.core.sheet_force import sheet_behaviour_of
 from handtouch.field import Surface
 from handtouch.field.model import ChannelModel
 from handtouch.hand import pad_channels, pad_surface
 from handtouch.host.units import GRAM_FORCE_N
+from handtouch.sheet import Fluctuation
 
 _MAX_CENTRE_OFFSET_FRACTION = 0.3
 """Distance from the middle over a side: farther out, the sheet's resistance changes quickly."""
@@ -154,3 +157,28 @@ class PadCircuitModel:
         """Return the rectangle's (x, y), and metres on the surface per unit of the rectangle."""
         x, y = self._surface.to_rectangle(*position_m)
         return float(x), float(y), float(self._surface.scale(x, y))
+
+
+_MIN_RESPONSE = 0.1  # of a sheet that passed current, whatever its model
+
+
+def with_responses(sheet: config.Sheet, readings: Sequence[WeightReading]) -> list[WeightReading]:
+    """Return consecutive readings of a sheet with its responses by the behaviour that its table states.
+
+    The sheet is fresh at first; each weight stays until the pad is unloaded before the next one. Without
+    behaviour, or times, the readings are returned as they are.
+    """
+    known = all(math.isfinite(reading.unloaded_s) for reading in readings)
+    if sheet.behaviour is None or not known:
+        return list(readings)
+    steady = replace(sheet_behaviour_of(sheet.behaviour).model, fluctuation=Fluctuation())
+    state, made = steady.initial_state(1), list[WeightReading]()
+    for reading in readings:
+        if made:
+            weight_n, measured_s = made[-1].weight.force_n, made[-1].measured_s
+            steady.discretise(max(reading.unloaded_s - measured_s, 0.0)).forward(state, weight_n)
+        steady.discretise(max(reading.loaded_s - reading.unloaded_s, 0.0)).forward(state, 0.0)
+        step = steady.discretise(reading.measured_s - reading.loaded_s)
+        (apparent_n,) = step.forward(state, reading.weight.force_n)
+        made.append(replace(reading, response=max(apparent_n / reading.weight.force_n, _MIN_RESPONSE)))
+    return made

@@ -1,17 +1,19 @@
-"""Descriptions of where to press on a pad, by directions in the frame of its link.
+"""Where to press on a pad, by directions in the frame of its link, and bars of what its channels read.
 
-Public names: `describe_position`, `describe_press`, `describe_arc_press`.
+Public names: `describe_position`, `describe_press`, `describe_arc_press`, `render_channel_bars`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.text import Text
 
 from handtouch import config
 from handtouch.field.model import ChannelModel
 from handtouch.hand import mount_transform, pad_surface
 from handtouch.procedures.commission.electrode_order import PRESS_TARGETS, target_fractions
+from handtouch.procedures.commission.press import PRESS_THRESHOLD_SIGMA, PressDetector
 
 _MIN_NAMED_COMPONENT_FRACTION = 0.6  # component over the greatest one, to be named too
 _OPPOSITE_ELECTRODE: dict[str, str] = {"x0": "xa", "xa": "x0", "y0": "yb", "yb": "y0"}
@@ -77,3 +79,24 @@ def _describe_direction(vector: NDArray[np.float64]) -> str:
     size = np.abs(vector)
     named = [axis for axis in np.argsort(-size) if size[axis] >= _MIN_NAMED_COMPONENT_FRACTION * size.max()]
     return " and ".join(f"{'-' if vector[axis] < 0 else '+'}{'xyz'[axis]}" for axis in named[:2])
+
+
+_BAR_COLUMNS = 40
+
+
+def render_channel_bars(slot: int, name: str, detector: PressDetector, channels: int) -> Text:
+    """Return bars of a slot's first `channels`, scaled to the strongest, at least to half the press
+    threshold.
+    """
+    deltas = detector.deltas[slot, :channels]
+    scale = max(float(np.abs(deltas).max()), PRESS_THRESHOLD_SIGMA * float(detector.noise_counts[slot]) / 2)
+    pressed = detector.level_sigma[slot] > PRESS_THRESHOLD_SIGMA
+    text = Text()
+    for channel, delta in enumerate(deltas.tolist(), 1):
+        filled = round(_BAR_COLUMNS * abs(delta) / scale)
+        text.append(f"  {channel} ", "dim")
+        text.append("█" * filled, "cyan" if pressed else "dim")
+        text.append("·" * (_BAR_COLUMNS - filled), "dim")
+        text.append(f" {delta:+7.0f}\n")
+    text.append(f"  {name}   a: again, s: skip, q: quit", "dim")
+    return text

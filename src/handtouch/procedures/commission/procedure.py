@@ -22,7 +22,6 @@ from handtouch.core.least_threshold import begin_samples, least_begin_counts
 from handtouch.core.pad_model import PadModel
 from handtouch.hand import pad_channels, pad_surface
 from handtouch.procedures.commission import press_instructions as words
-from handtouch.procedures.commission.channel_bars import render_channel_bars
 from handtouch.procedures.commission.deployment_edit import PadEdit
 from handtouch.procedures.commission.electrode_order import (
     ElectrodeOrder,
@@ -40,6 +39,7 @@ from handtouch.procedures.commission.press import (
     find_reversed_channels,
     reacting_channels,
 )
+from handtouch.procedures.commission.press_instructions import render_channel_bars
 from handtouch.procedures.commission.sample_source import HandSample
 from handtouch.procedures.dialogue import Dialogue, DialogueCancelled, GuidedProcedure, Key
 

@@ -1,7 +1,7 @@
 """Conformance of sensor nodes on a bus with docs/firmware.md: `handtouch conformance`.
 
 `procedure.run_checks` tests one node over a `Line`, in the line's time, and returns a `NodeReport`; it prints
-nothing. `object_checks`, `network_checks`, `pdo_checks`, `lss_checks` and `operator_checks` are its stages,
+nothing. `object_checks`, `network_checks`, `pdo_checks` and `operator_checks` are its stages,
 `catalogue` lists the checks, `required_objects` the objects that a node needs.
 """
 

@@ -1,4 +1,7 @@
-"""Checks of NMT, heartbeat or node guarding, and EMCY."""
+"""Checks of NMT, heartbeat or node guarding, EMCY, and the LSS slave (CiA 305) of a node that has an id.
+
+LSS is read only: nothing is configured or stored.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import statistics
 from itertools import pairwise
 
 from handtouch.canbus import cia301
+from handtouch.canbus.cia305 import LssAddress
+from handtouch.canbus.find.lss import LssError, LssMaster
 from handtouch.canbus.nodes.boot import read_errors
 from handtouch.canbus.objects.emergency import ErrorLog
 from handtouch.canbus.objects.sdo import BootStepError
@@ -186,3 +191,40 @@ def _describe_errors(session: NodeSession) -> list[str]:
     texts = [log.describe()] if log.register else []
     passing = [error.text for error in log.emergencies if error.cleared_ns is not None]
     return texts + [f"EMCY {text}, cleared" for text in passing]
+
+
+def check_lss(session: NodeSession) -> None:
+    """Check selection by 0x1018, the id returned, and deselection."""
+    report, identity = session.report, session.report.identity
+    names = ("lss.select", "lss.compares")
+    why = ""
+    if not session.options.lss:
+        why = "left out by --no-lss"
+    elif identity is None or None in (identity.product_code, identity.revision, identity.serial):
+        why = "the identity is incomplete"
+    if why or identity is None:
+        report.not_tested(why, *names)
+        return
+    address = LssAddress(
+        identity.vendor_id, identity.product_code or 0, identity.revision or 0, identity.serial or 0
+    )
+    master = LssMaster(session.link.exchange_lss, clock=session.link.now_ns)
+    master.deselect_all()
+    if not master.request_selection(address):
+        master.deselect_all()
+        report.not_tested("no response to LSS; needed only where LSS is to assign the node id", *names)
+        return
+    compares = not master.answers_contradiction()
+    try:
+        node_id = master.inquire_node_id(address)
+        problems = [] if node_id == session.node.node_id else [f"returns node id {node_id}"]
+        report.assess("lss.select", problems)
+    except LssError as error:
+        report.failed("lss.select", str(error))
+    other = LssAddress(*address.parts[:3], address.serial ^ 1)
+    is_wrong = master.request_selection(other)
+    master.deselect_all()
+    detail = (
+        "" if compares else "in configuration state it responds to any fast scan, which `scan` copes with"
+    )
+    report.assess("lss.compares", [f"responds to serial number {other.serial}"] if is_wrong else [], detail)

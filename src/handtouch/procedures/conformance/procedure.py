@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 from handtouch.canbus import cia301
 from handtouch.canbus.objects.sdo import BootStepError
 from handtouch.procedures.conformance import (
-    lss_checks,
     network_checks,
     object_checks,
     operator_checks,
@@ -131,7 +130,7 @@ def _run_stages(session: NodeSession) -> None:
         ("heartbeat", network_checks.check_heartbeat),
         ("NMT states", network_checks.check_states),
         ("TPDOs", pdo_checks.check_stream),
-        ("LSS", lss_checks.check_lss),
+        ("LSS", network_checks.check_lss),
         ("NMT reset communication", _reset_communication),
         ("errors", network_checks.summarise_errors),
         ("operator", operator_checks.check_with_operator),

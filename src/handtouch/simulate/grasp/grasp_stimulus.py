@@ -1,6 +1,7 @@
-"""Grasp as the stimulus of a simulated hand: contact discs on the pads, and reported joint positions.
+"""Grasp as the stimulus of a simulated hand: contact discs, forces on the pads, reported joint positions.
 
-Public names: `GraspStimulus`, `EncoderErrors`. Between two steps of MuJoCo the earlier state holds.
+Public names: `GraspStimulus`, `EncoderErrors`, `PadForces`, `pad_forces`. Between two steps of MuJoCo the
+earlier state holds.
 """
 
 from __future__ import annotations
@@ -20,10 +21,40 @@ from handtouch.simulate.faults import Fault
 from handtouch.simulate.grasp.mujoco_scene import TIME_STEP_S
 from handtouch.simulate.grasp.patches import ContactPatches
 from handtouch.simulate.grasp.simulation import GraspRecord
-from handtouch.simulate.grasp.tangential import pad_forces
 from handtouch.simulate.node_faults import NodeFault
 from handtouch.simulate.stimulus import AppliedContact, JointTrajectory, NodeReplacement
 from handtouch.simulate.worlds import DrawnWorld, HiddenJoints
+
+
+@dataclass(frozen=True)
+class PadForces:
+    """Forces on one pad over time: tangential (2, n) along its x and y, and normal (n,) [N]."""
+
+    tangential_n: FloatArray
+    normal_n: FloatArray
+
+
+def pad_forces(grasp: GraspRecord, row: int) -> PadForces:
+    """Return MuJoCo's forces on a pad at each of the n steps, sums of those of its contacts."""
+    pad, count = grasp.pads[row], len(grasp.times_s)
+    mine = grasp.pad_row == row
+    step = grasp.step_index[mine]
+    rotation = grasp.link_rotation[step, row]
+    on_link = np.einsum("kji,kj->ki", rotation, grasp.point_m[mine] - grasp.link_m[step, row])
+    force = np.einsum("kji,kj->ki", rotation, grasp.force_n[mine]) @ pad.rotation
+    foot = pad.shape.project((on_link - pad.translation_m) @ pad.rotation)
+    inward = np.einsum("ki,ki->k", force, foot.normal)
+    along = force - inward[:, None] * foot.normal
+    across = np.cross(foot.normal, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    forward = np.cross(across, foot.normal)
+    total = np.zeros((3, count))
+    for k, values in enumerate(
+        (np.einsum("ki,ki->k", along, forward), np.einsum("ki,ki->k", along, across), -inward)
+    ):
+        np.add.at(total[k], step, values)
+    return PadForces(total[:2], total[2])
+
 
 _FORCE_SAMPLING_STEPS = 8  # between samples of the force for the sheet's history
 _MIN_GAP_STEPS = 20  # shorter interruptions don't end a press
