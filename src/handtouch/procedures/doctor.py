@@ -29,6 +29,7 @@ from handtouch.host import realtime
 from handtouch.host.endpoints import to_connect
 from handtouch.host.installation import compile_command, extra_command
 from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
+from handtouch.procedures.timing_checks import check_timing
 
 CheckState = Literal["ok", "warn", "fail"]
 _ENDPOINT_IN_USE_REMEDY = (
@@ -60,9 +61,16 @@ def check_host(deployment: config.Deployment | None, machine: Machine | None = N
     for bus in deployment.buses if deployment else ():
         yield from check_bus(bus, machine)
     hands = {hand.name for hand in deployment.hands} if deployment else None
-    yield from check_endpoints(deployment.daemon if deployment else config.Daemon(), hands)
-    yield from check_keys(deployment.daemon if deployment else config.Daemon())
-    yield from check_realtime(deployment.daemon if deployment else config.Daemon())
+    daemon = deployment.daemon if deployment else config.Daemon()
+    yield from check_endpoints(daemon, hands)
+    yield from check_keys(daemon)
+    yield from check_realtime(daemon)
+    wants_realtime = bool(daemon.realtime_priority or daemon.cpus)
+    for fact in check_timing(deployment, machine):
+        if fact.is_good or not wants_realtime:
+            yield HostCheck(fact.subject, "ok", fact.detail)
+        else:
+            yield HostCheck(fact.subject, "warn", fact.detail, fact.remedy)
 
 
 def check_realtime(daemon: config.Daemon) -> Iterator[HostCheck]:
