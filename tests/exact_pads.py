@@ -59,7 +59,9 @@ class ExactNetworks:
         covariance, converged = np.full((len(x), 3, 3), np.nan), np.zeros(len(x), np.bool_)
         found = PointEstimate(x, y, total, residual, chi_squared, covariance, converged)
         for pad, points in self._groups(np.asarray(index)):
-            found.assign(points, estimate(self.networks[pad], currents[:, points], sigma[:, points]))
+            some = estimate(self.networks[pad], currents[:, points], sigma[:, points])
+            for name, values in vars(found).items():
+                values[points] = getattr(some, name)
         return found
 
     def _groups(self, index: IndexArray) -> Iterator[tuple[int, IndexArray]]:

@@ -9,8 +9,8 @@ from handtouch.config import parse
 from handtouch.core.stages.shear import REST_SAMPLES
 from handtouch.hand import mount_transform
 from handtouch.simulate.contact_patch import ContactPatch
+from handtouch.simulate.shear_pad import VirtualShear
 from handtouch.simulate.touch import ScenarioTouch, ScheduledTouches
-from handtouch.simulate.virtual_shear import VirtualShear
 from handtouch.simulate.worlds import WORLDS, DrawnWorld
 from tests.core.shear_bench import ShearBench, shear_deployment
 

@@ -8,6 +8,7 @@ where all of them are free, else free ports.
 from __future__ import annotations
 
 import argparse
+import itertools
 import logging
 import os
 import socket
@@ -253,14 +254,11 @@ def _with_palm_output(deployment: Deployment) -> Deployment:
 
 def _with_supervisor(deployment: Deployment) -> Deployment:
     """Return the deployment with a supervisor, and serial numbers for it."""
-    first = 1001
-    hands = []
-    for hand in deployment.hands:
-        pads = tuple(pad.model_copy(update={"serial": first + k}) for k, pad in enumerate(hand.pads))
-        hands.append(hand.model_copy(update={"pads": pads}))
-        first += len(pads)
+    serials = itertools.count(1001)
     daemon = deployment.daemon.model_copy(update={"supervise": True, "store": "calibrations.db"})
-    return deployment.model_copy(update={"hands": tuple(hands), "daemon": daemon})
+    return deployment.model_copy(update={"daemon": daemon}).with_pads(
+        lambda _, pad: pad.model_copy(update={"serial": next(serials)})
+    )
 
 
 def in_process_deployment(deployment: Deployment) -> Deployment:

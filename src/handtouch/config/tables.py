@@ -6,7 +6,7 @@ follow one of several models.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -815,6 +815,14 @@ class Deployment(Table):
     def pads(self) -> list[NamedPad]:
         """All pads in the order of the file; a pad's row everywhere is its index here."""
         return [NamedPad(hand.name, pad) for hand in self.hands for pad in hand.pads]
+
+    def with_pads(self, change: Callable[[str, Pad], Pad]) -> Deployment:
+        """Return the deployment with each pad as `change` makes it of its hand's name and itself."""
+        hands = tuple(
+            hand.model_copy(update={"pads": tuple(change(hand.name, pad) for pad in hand.pads)})
+            for hand in self.hands
+        )
+        return self.model_copy(update={"hands": hands})
 
     def touch_of(self, pad: Pad) -> Touch:
         """Return the thresholds of a pad: its own, or those of all."""

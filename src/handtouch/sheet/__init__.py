@@ -1,6 +1,6 @@
 """Sheet behaviour over time: forward models for simulation, inverse ones for compensation. No I/O."""
 
-from handtouch.sheet.adaptation import Adaptation, AdaptationState
+from handtouch.sheet.adaptation import Adaptation
 from handtouch.sheet.bank import (
     BANK_LEARNED,
     BANK_MODELS,
@@ -13,7 +13,6 @@ from handtouch.sheet.bank import (
 from handtouch.sheet.behaviour import (
     SheetModel,
     SheetModelState,
-    SheetStep,
     TemperatureResponse,
 )
 from handtouch.sheet.compensator import (
@@ -22,7 +21,7 @@ from handtouch.sheet.compensator import (
     SheetCompensator,
 )
 from handtouch.sheet.creep import Creep
-from handtouch.sheet.fluctuation import Fluctuation, FluctuationState
+from handtouch.sheet.fluctuation import Fluctuation
 from handtouch.sheet.hysteresis import PrandtlIshlinskii
 from handtouch.sheet.presets import (
     S1,
@@ -38,20 +37,17 @@ __all__ = [
     "S2",
     "UNKNOWN",
     "Adaptation",
-    "AdaptationState",
     "BankPrior",
     "BankState",
     "CompensatorState",
     "Creep",
     "Fluctuation",
-    "FluctuationState",
     "ModelBank",
     "ParameterUncertainty",
     "PrandtlIshlinskii",
     "SheetCompensator",
     "SheetModel",
     "SheetModelState",
-    "SheetStep",
     "TemperatureResponse",
     "check_learned",
 ]

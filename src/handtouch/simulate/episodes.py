@@ -14,8 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from handtouch import config
-from handtouch.simulate import draws
-from handtouch.simulate.faults import FAULTS, Fault, Gum, Heat, Moisture
+from handtouch.simulate.faults import FAULTS, Fault, Gum, Heat, Moisture, draw_position
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.touch import ScenarioTouch
@@ -74,7 +73,7 @@ def _draw_ordinary_touches(
                 link,
                 begin_s,
                 touch_s,
-                [draws.position(rng) for _ in range(points)],
+                [draw_position(rng) for _ in range(points)],
                 int(rng.choice([1, 1, 2, 3])),
             )
         )
@@ -122,7 +121,7 @@ def _draw_grasp(
     """Draw ordinary use, then an object held almost to the end: its position and force vary a little."""
     begins = duration_s * float(rng.uniform(0.1, 0.3))
     holds = duration_s * float(rng.uniform(0.5, 0.65))
-    middle = np.array(draws.position(rng, 0.2))
+    middle = np.array(draw_position(rng, 0.2))
     steps = max(int(holds / 20), 2)
     path = [tuple((middle + rng.uniform(-wander, wander, 2)).tolist()) for _ in range(steps)]
     held = _draw_touch(rng, link, begins, holds, path, steps + 1, 0.06)

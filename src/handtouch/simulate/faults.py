@@ -3,11 +3,12 @@
 A fault class declares its `kind`, the keys of its `[[fault]]` table, its effects, and how to draw one at
 random; everything else follows from the class. Public names: `Fault` and its subclasses, `FAULTS` (by kind),
 `INFLUENCES` (not faults, but with similar effects), `AnyFault` (any of them, as a scenario file has it),
-`electrode_index`.
+`electrode_index`, `draw_position`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -20,7 +21,6 @@ from pydantic import Field, model_validator
 from handtouch.arrays import BoolArray, FloatArray
 from handtouch.config.base import Name, NonNegative, OneOfKinds, Positive, Table
 from handtouch.config.tables import SIDE_ELECTRODES, Electrode
-from handtouch.simulate import draws
 from handtouch.simulate.sheet_circuit import Wiring
 from handtouch.simulate.smoothstep import smoothstep_array
 from handtouch.wire.faults import FaultKind
@@ -134,9 +134,9 @@ class Gum(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
         """Draw the keys that are the kind's own."""
-        force_n = draws.log_uniform(rng, 0.15, 1.5)
+        force_n = log_uniform(rng, 0.15, 1.5)
         return {
-            "place": draws.position(rng),
+            "place": draw_position(rng),
             "radius_mm": float(rng.uniform(0.06, 0.16)) * min(size_mm),
             "force_n": force_n,
             "press_n": force_n * float(rng.uniform(1.5, 5)),
@@ -171,10 +171,10 @@ class Moisture(Fault):
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
         """Draw the keys that are the kind's own."""
         return {
-            "place": draws.position(rng, 0.2),
+            "place": draw_position(rng, 0.2),
             "radius_mm": float(rng.uniform(0.2, 0.5)) * min(size_mm),
-            "leak_ohm": draws.log_uniform(rng, 2e3, 3e4),
-            "grow_s": draws.log_uniform(rng, 10, 60),
+            "leak_ohm": log_uniform(rng, 2e3, 3e4),
+            "grow_s": log_uniform(rng, 10, 60),
         }
 
     def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts:
@@ -205,7 +205,7 @@ class DeadElectrode(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        return {"electrode": draws.electrode(rng)}
+        return {"electrode": draw_electrode(rng)}
 
     def modify_wiring(self, wiring: Wiring) -> None:
         """Add the break to the electrode's resistor."""
@@ -229,7 +229,7 @@ class ShortedElectrode(Fault):
         """Draw the keys that are the kind's own."""
         one, other = rng.permutation(SIDE_ELECTRODES)[:2].tolist()
         to = "layer" if rng.random() < 0.5 else other
-        return {"electrode": one, "to": to, "short_ohm": draws.log_uniform(rng, 0.5, 20)}
+        return {"electrode": one, "to": to, "short_ohm": log_uniform(rng, 0.5, 20)}
 
     @model_validator(mode="after")
     def _check_other_electrode(self) -> Self:
@@ -286,7 +286,7 @@ class SaturatedChannel(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        return {"electrode": draws.electrode(rng), "high": bool(rng.random() < 0.8)}
+        return {"electrode": draw_electrode(rng), "high": bool(rng.random() < 0.8)}
 
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to its limit."""
@@ -305,7 +305,7 @@ class StuckChannel(Fault):
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
         count = int(rng.integers(-2000, 20_000)) if rng.random() < 0.3 else None
-        return {"electrode": draws.electrode(rng), "count": count}
+        return {"electrode": draw_electrode(rng), "count": count}
 
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to the count."""
@@ -344,8 +344,8 @@ class Offset(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        counts = draws.log_uniform(rng, 60, 3000) * float(rng.choice([-1, 1]))
-        return {"electrode": draws.electrode(rng), "counts": counts}
+        counts = log_uniform(rng, 60, 3000) * float(rng.choice([-1, 1]))
+        return {"electrode": draw_electrode(rng), "counts": counts}
 
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Add the offset."""
@@ -363,8 +363,8 @@ class GainStep(Fault):
     @classmethod
     def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
         """Draw the keys that are the kind's own."""
-        factor = draws.log_uniform(rng, 1.15, 2.0) ** float(rng.choice([-1, 1]))
-        return {"electrode": draws.electrode(rng), "factor": factor}
+        factor = log_uniform(rng, 1.15, 2.0) ** float(rng.choice([-1, 1]))
+        return {"electrode": draw_electrode(rng), "factor": factor}
 
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Apply the new gain."""
@@ -405,3 +405,19 @@ def electrode_index(electrode: str) -> int:
     if electrode not in SIDE_ELECTRODES:
         return int(electrode.removeprefix("t")) - 1
     return SIDE_ELECTRODES.index(electrode)
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def draw_electrode(rng: np.random.Generator) -> str:
+    """Draw an electrode's name."""
+    return str(rng.choice(SIDE_ELECTRODES))
+
+
+def draw_position(rng: np.random.Generator, margin: float = 0.12) -> tuple[float, float]:
+    """Draw a position (x, y) as fractions of a pad, at least `margin` from its sides."""
+    x, y = rng.uniform(margin, 1 - margin, 2).tolist()
+    return x, y

@@ -37,6 +37,7 @@ from handtouch.simulate.film import FilmRatio
 from handtouch.simulate.pad_circuit import PadCircuit
 from handtouch.simulate.pad_geometry import SimulatedSurface
 from handtouch.simulate.response_circuit import ResponseCircuit, response_circuit
+from handtouch.simulate.shear_pad import VirtualShear
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
 from handtouch.simulate.sheet_physics import SheetLaw
 from handtouch.simulate.sheet_solver import ArcEnds, ElectrodeGaps
@@ -45,7 +46,6 @@ from handtouch.simulate.stimulus import NodeReplacement, PadStimulus, Stimulus
 from handtouch.simulate.surfaces import simulated_surface
 from handtouch.simulate.two_layers import two_layer_circuit
 from handtouch.simulate.unevenness import Unevenness
-from handtouch.simulate.virtual_shear import VirtualShear
 from handtouch.simulate.worlds import UNEVEN_MODES, DrawnWorld, HiddenPad
 
 CountArray = NDArray[np.int64]

@@ -10,6 +10,7 @@ clock; an unknown number is nil, never NaN. Optional fields are left out where t
 
 from handtouch.wire.codec import (
     SCHEMA_VERSION,
+    SequenceTracker,
     UnknownTopicError,
     WireError,
     decode,
@@ -45,7 +46,6 @@ from handtouch.wire.health import (
 )
 from handtouch.wire.percept_input import PerceptInput
 from handtouch.wire.recording import Config, Raw, StateSnapshot, TickInputs
-from handtouch.wire.sequence import SequenceTracker
 from handtouch.wire.service import Service
 from handtouch.wire.status import (
     ContactRadiusStatus,

@@ -54,20 +54,12 @@ PadEdits = Mapping[tuple[str, str], PadEdit]
 
 def apply_edits(deployment: config.Deployment, edits: PadEdits) -> config.Deployment:
     """Return the deployment with the edits."""
-    hands = tuple(
-        hand.model_copy(
-            update={
-                "pads": tuple(
-                    pad.model_copy(update=edits[hand.name, pad.link].as_keys())
-                    if (hand.name, pad.link) in edits
-                    else pad
-                    for pad in hand.pads
-                )
-            }
-        )
-        for hand in deployment.hands
-    )
-    return deployment.model_copy(update={"hands": hands})
+
+    def edited(hand: str, pad: config.Pad) -> config.Pad:
+        edit = edits.get((hand, pad.link))
+        return pad if edit is None else pad.model_copy(update=edit.as_keys())
+
+    return deployment.with_pads(edited)
 
 
 def edit_text(text: str, edits: PadEdits) -> str:

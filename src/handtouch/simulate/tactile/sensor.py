@@ -260,11 +260,7 @@ def _repeated(deployment: config.Deployment, count: int) -> config.Deployment:
 def _with_electrodes_only(deployment: config.Deployment) -> config.Deployment:
     """Return a deployment without shear pads and second sheets: a reading has four channels."""
     left_out = {"shear": None, "second_sheet": None}
-    hands = tuple(
-        hand.model_copy(update={"pads": tuple(pad.model_copy(update=left_out) for pad in hand.pads)})
-        for hand in deployment.hands
-    )
-    return deployment.model_copy(update={"hands": hands})
+    return deployment.with_pads(lambda _, pad: pad.model_copy(update=left_out))
 
 
 def _channel_limits(deployment: config.Deployment) -> NDArray[np.int64]:

@@ -82,18 +82,10 @@ class ResponseSpread:
             known = {key: value for key, value in told.items() if key in type(table).model_fields}
             return table.model_copy(update=known)
 
-        hands = tuple(
-            hand.model_copy(
-                update={
-                    "pads": tuple(
-                        pad.model_copy(update={"response": described(pad.response)}) for pad in hand.pads
-                    )
-                }
-            )
-            for hand in deployment.hands
-        )
         responses = {name: described(table) for name, table in deployment.responses.items()}
-        return deployment.model_copy(update={"hands": hands, "responses": responses})
+        return deployment.model_copy(update={"responses": responses}).with_pads(
+            lambda _, pad: pad.model_copy(update={"response": described(pad.response)})
+        )
 
 
 @dataclass(frozen=True)
