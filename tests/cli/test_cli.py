@@ -119,10 +119,11 @@ def _short_wait(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_short_wait")
-def test_status_without_a_daemon_exits_with_status_1_and_a_remedy(
-    endpoints: dict[str, str], capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", [["status"], ["scene"], ["tare"], ["log", "info"]], ids="_".join)
+def test_a_request_without_a_daemon_exits_with_status_1_and_a_remedy(
+    command: list[str], endpoints: dict[str, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["status", "--endpoint", endpoints["control"]]) == 1
+    assert main([*command, "--endpoint", endpoints["control"]]) == 1
     assert "start `handtouch run FILE`" in capsys.readouterr().err
 
 

@@ -49,7 +49,10 @@ def start() -> Iterator[Start]:
     with contextlib.ExitStack() as stack:
 
         def started(program: list[str], *arguments: str) -> subprocess.Popen[str]:
-            process = subprocess.Popen([*program, *arguments], stdout=subprocess.PIPE, text=True)
+            pipe = subprocess.PIPE
+            process = subprocess.Popen(
+                [*program, *arguments], stdin=pipe, stdout=pipe, stderr=pipe, text=True
+            )
             stack.enter_context(process)
             stack.callback(process.kill)
             return process
@@ -228,47 +231,41 @@ def test_the_newest_frames_of_a_daemon_are_those_of_its_messages(
     assert shown > 10
 
 
-@pytest.mark.parametrize("program", LANGUAGES, indirect=True)
 @pytest.mark.parametrize("ends", [False, True], ids=["hangs", "ends"])
-def test_no_frame_is_old_after_the_daemon_hung_or_ended_while_the_program_computed(
-    publisher: Any, endpoints: dict[str, str], program: list[str], ends: bool
+def test_no_frame_is_old_after_the_daemon_hung_or_ended_while_programs_computed(
+    publisher: Any, endpoints: dict[str, str], programs: dict[str, list[str]], start: Start, ends: bool
 ) -> None:
-    with subprocess.Popen(
-        [*program, "ages", endpoints["live"], "100"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        seqs, ready = itertools.count(1), threading.Event()
+    running = [start(program, "ages", endpoints["live"], "100") for program in programs.values()]
+    seqs, ready = itertools.count(1), threading.Event()
 
-        def publish() -> None:
-            t_ns = time.monotonic_ns()
-            publisher.send_multipart(wire.encode(make_frame(next(seqs), t_ns=t_ns)))
-            time.sleep(0.005)
+    def publish() -> None:
+        t_ns = time.monotonic_ns()
+        publisher.send_multipart(wire.encode(make_frame(next(seqs), t_ns=t_ns)))
+        time.sleep(0.005)
 
-        assert process.stdout is not None
-        output_lines = process.stdout
+    def await_ready() -> None:
+        for process in running:
+            assert process.stdout is not None
+            process.stdout.readline()
+        ready.set()
 
-        def await_ready() -> None:
-            output_lines.readline()
-            ready.set()
-
-        reader = threading.Thread(target=await_ready)
-        reader.start()
-        end_s = time.monotonic() + LONGEST_S
-        while not ready.is_set() and time.monotonic() < end_s:
-            publish()
-        for _ in range(100):  # these wait in the program
-            publish()
-        if ends:
-            publisher.close(linger=1000)
-        else:
-            time.sleep(1.0)
+    reader = threading.Thread(target=await_ready)
+    reader.start()
+    end_s = time.monotonic() + LONGEST_S
+    while not ready.is_set() and time.monotonic() < end_s:
+        publish()
+    for _ in range(100):  # these wait in the programs
+        publish()
+    if ends:
+        publisher.close(linger=1000)
+    else:
+        time.sleep(1.0)
+    for process in running:
         output, _ = process.communicate("\n", timeout=LONGEST_S)
-    lines = [json.loads(line) for line in output.splitlines()]
-    assert len(lines) == 100
-    assert all(line["kind"] == "none" or line["age_s"] < 0.1 for line in lines)
-    assert lines[-1]["kind"] == "none"
+        lines = [json.loads(line) for line in output.splitlines()]
+        assert len(lines) == 100
+        assert all(line["kind"] == "none" or line["age_s"] < 0.1 for line in lines)
+        assert lines[-1]["kind"] == "none"
 
 
 @pytest.mark.parametrize("program", LANGUAGES, indirect=True)
@@ -283,14 +280,14 @@ def test_an_unknown_hand_is_an_error_that_names_those_of_the_daemon(
     assert reader.communicate(timeout=LONGEST_S)[0] == "the daemon has no hand 'rigth'; it has right, left\n"
 
 
-@pytest.mark.parametrize("program", LANGUAGES, indirect=True)
-def test_the_absence_of_a_daemon_is_logged(program: list[str], endpoints: dict[str, str]) -> None:
-    command = [*program, "newest", endpoints["live"], "1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as reader:
+def test_the_absence_of_a_daemon_is_logged(
+    programs: dict[str, list[str]], start: Start, endpoints: dict[str, str]
+) -> None:
+    running = [start(program, "newest", endpoints["live"], "1") for program in programs.values()]
+    for reader in running:
         assert reader.stderr is not None
         line = reader.stderr.readline()
-        reader.kill()
-    assert line == f"handtouch: no daemon at {endpoints['live']}; start `handtouch run FILE`\n"
+        assert line == f"handtouch: no daemon at {endpoints['live']}; start `handtouch run FILE`\n"
 
 
 @pytest.mark.parametrize("program", LANGUAGES, indirect=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import math
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -281,19 +279,6 @@ def test_calibration_applies_to_the_next_contact_message(served: Served) -> None
         assert after.id == before.id
         assert after.total_current_a == pytest.approx(2 * before.total_current_a, rel=0.02)
     assert served.call("calibrate", "palm_heel", "--name", "x", "--gains", "0", "1", "1", "1")[0] == 1
-
-
-def test_commands_report_a_missing_daemon(tmp_path: Path) -> None:
-    nowhere = ["--endpoint", f"ipc://{tmp_path}/none"]
-    asking = [
-        subprocess.Popen(
-            [sys.executable, "-m", "handtouch", *command, *nowhere], stderr=subprocess.PIPE, text=True
-        )
-        for command in (["scene"], ["tare"], ["log", "info"])
-    ]
-    for process in asking:  # side by side: each waits for an answer
-        _, output = process.communicate(timeout=LONGEST_S)
-        assert (process.returncode, "start `handtouch run FILE`" in output) == (1, True)
 
 
 def test_every_request_prints_json(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
