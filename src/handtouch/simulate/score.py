@@ -1,6 +1,6 @@
 """Compare reported contacts with the ground truth: errors, their bounds and intervals, missed touches.
 
-Public names: `score_contacts` -> `Score`, `LinkScore`, `ContactLike`.
+Public names: `score_contacts` -> `Score`, `LinkScore`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,10 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from handtouch import wire
 from handtouch.arrays import FloatArray
 from handtouch.simulate.truth import GroundTruth, Vector
 
@@ -23,33 +22,6 @@ _MAX_DELAY_PERIODS = 5
 _95_PERCENT_CHI2 = 0.0, 3.841, 5.991, 7.815  # quantiles by degrees of freedom; two along a pad
 _MIN_RELATIVE_VARIANCE = 1e-6  # variance of an axis, over the greatest, to count as one
 _95_PERCENT_SIGMA = 1.96
-
-
-class ContactLike(Protocol):
-    """Attributes that a contact needs; `handtouch.wire.Contact` has them."""
-
-    @property
-    def hand(self) -> str: ...
-    @property
-    def link(self) -> str: ...
-    @property
-    def t_ns(self) -> int: ...
-    @property
-    def event(self) -> str: ...
-    @property
-    def fresh(self) -> bool: ...
-    @property
-    def position_m(self) -> Vector | None: ...
-    @property
-    def covariance_m2(self) -> Sequence[float] | None: ...
-    @property
-    def position_status(self) -> str: ...
-    @property
-    def force_n(self) -> float | None: ...
-    @property
-    def force_std_n(self) -> float | None: ...
-    @property
-    def force_status(self) -> str: ...
 
 
 @dataclass(frozen=True)
@@ -66,12 +38,7 @@ class LinkScore:
     mount_error_m: float
     """Rms distance that contacts are off because pads aren't mounted as stated."""
     rms_bound_m: float
-    median_error_m: float
     max_error_m: float
-    bias_m: float
-    """Rms over samples of the mean error vector of each touch."""
-    scatter_m: float
-    """Rms of the error vectors without that mean."""
     position_coverage: float
     """Share of the `valid` positions on the pad within their stated 95 % region."""
     rms_force_error_n: float
@@ -142,7 +109,7 @@ class Score:
         )
 
 
-def score_contacts(contacts: Iterable[ContactLike], truth: Sequence[GroundTruth]) -> Score:
+def score_contacts(contacts: Iterable[wire.Contact], truth: Sequence[GroundTruth]) -> Score:
     """Match contact samples to the ground truth by link and nearest time, within half a period, and compare.
 
     Samples of the event "end" are left out, and those without position don't count for position errors. The
@@ -151,7 +118,7 @@ def score_contacts(contacts: Iterable[ContactLike], truth: Sequence[GroundTruth]
     by_link: dict[tuple[str, str], list[GroundTruth]] = defaultdict(list)
     for record in truth:
         by_link[record.hand, record.link].append(record)
-    reported: dict[tuple[str, str], list[ContactLike]] = defaultdict(list)
+    reported: dict[tuple[str, str], list[wire.Contact]] = defaultdict(list)
     for contact in contacts:
         reported[contact.hand, contact.link].append(contact)
     for records in by_link.values():
@@ -174,7 +141,7 @@ class _MatchedLink:
     """Contacts of one link, matched to its ground truth."""
 
     def __init__(
-        self, truth: list[GroundTruth], contacts: list[ContactLike], period_ns: int, end_ns: int = 0
+        self, truth: list[GroundTruth], contacts: list[wire.Contact], period_ns: int, end_ns: int = 0
     ) -> None:
         """`end_ns`: of all ground truth; touches that begin too late to be noticed before it don't count."""
         times = [record.t_ns for record in truth]
@@ -204,9 +171,6 @@ class _MatchedLink:
         )
         self.pad_error_m = self.error_m - self.mount_error_m
         self.bound_m = np.array([record.bound_m for _, record, _ in located])
-        self.mean_error_m = _mean_error_by_touch(
-            self.error_m, np.array([touch for _, _, touch in located], np.intp)
-        )
         self.position_held = np.array(
             [
                 _is_within(error, contact.covariance_m2)
@@ -232,7 +196,7 @@ def _vectors(rows: Iterable[FloatArray]) -> FloatArray:
     return np.array(list(rows), np.float64).reshape(-1, 3)
 
 
-def _position(contact: ContactLike) -> Vector:
+def _position(contact: wire.Contact) -> Vector:
     assert contact.position_m is not None
     return contact.position_m
 
@@ -250,7 +214,6 @@ def _is_within(error_m: FloatArray, covariance_m2: Sequence[float]) -> bool:
 
 def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
     error = np.concatenate([found.error_m for found in matched])
-    mean = np.concatenate([found.mean_error_m for found in matched])
     length = np.linalg.norm(error, axis=1)
     has_samples = len(length) > 0
     return LinkScore(
@@ -262,10 +225,7 @@ def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
             np.linalg.norm(np.concatenate([found.mount_error_m for found in matched]), axis=1)
         ),
         rms_bound_m=_rms(np.concatenate([found.bound_m for found in matched])),
-        median_error_m=float(np.median(length)) if has_samples else np.nan,
         max_error_m=float(length.max()) if has_samples else np.nan,
-        bias_m=_rms(np.linalg.norm(mean, axis=1)),
-        scatter_m=_rms(np.linalg.norm(error - mean, axis=1)),
         position_coverage=_mean(np.concatenate([found.position_held for found in matched])),
         rms_force_error_n=_rms(np.concatenate([found.force_error_n for found in matched])),
         force_coverage=_mean(np.concatenate([found.force_held for found in matched])),
@@ -295,13 +255,6 @@ def _nearest_index(times: list[int], t_ns: int) -> int:
 def _period_ns(by_link: Iterable[list[GroundTruth]]) -> int:
     steps = [after.t_ns - before.t_ns for records in by_link for before, after in itertools.pairwise(records)]
     return int(np.median(steps)) if steps else 0
-
-
-def _mean_error_by_touch(error: FloatArray, touch: NDArray[np.intp]) -> FloatArray:
-    """Return for each row of `error` (n, 3) the mean of the rows of its touch."""
-    count = np.maximum(np.bincount(touch), 1)
-    sums = np.stack([np.bincount(touch, weights=column) for column in error.T], axis=1)
-    return np.asarray((sums / count[:, None])[touch])
 
 
 def _ratio(count: int, of: int) -> float:
