@@ -46,7 +46,6 @@ class DesignResult:
     after: ElectrodeLayout
     map_before: FloatArray
     map_after: FloatArray
-    evaluations: int
 
     @property
     def value_before(self) -> float:
@@ -173,7 +172,7 @@ def optimise_layout(
     before, after = (goal_map(goal, fine, layout) for layout in (task.configured, best))
     if goal_value(before, statistic) <= goal_value(after, statistic) and electrodes is None:
         best, after = task.configured, before  # nothing better was found
-    return DesignResult(goal, statistic, task.configured, best, before, after, search.evaluations)
+    return DesignResult(goal, statistic, task.configured, best, before, after)
 
 
 class _Search:

@@ -38,6 +38,7 @@ class LinkScore:
     mount_error_m: float
     """Rms distance that contacts are off because pads aren't mounted as stated."""
     rms_bound_m: float
+    median_error_m: float
     max_error_m: float
     position_coverage: float
     """Share of the `valid` positions on the pad within their stated 95 % region."""
@@ -225,6 +226,7 @@ def _score_link(name: str, matched: Sequence[_MatchedLink]) -> LinkScore:
             np.linalg.norm(np.concatenate([found.mount_error_m for found in matched]), axis=1)
         ),
         rms_bound_m=_rms(np.concatenate([found.bound_m for found in matched])),
+        median_error_m=float(np.median(length)) if has_samples else np.nan,
         max_error_m=float(length.max()) if has_samples else np.nan,
         position_coverage=_mean(np.concatenate([found.position_held for found in matched])),
         rms_force_error_n=_rms(np.concatenate([found.force_error_n for found in matched])),

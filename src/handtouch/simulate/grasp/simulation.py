@@ -56,8 +56,6 @@ class GraspRecord:
     """(k,), step of each contact point."""
     pad_row: IntArray
     """(k,), row of its pad; -1: on another part of the hand."""
-    body_id: IntArray
-    """(k,), MuJoCo's body id of its link."""
     point_m: FloatArray
     """(k, 3), position in the palm's frame."""
     force_n: FloatArray
@@ -144,7 +142,7 @@ class _GraspRecorder:
             np.empty((n, 3)) for _ in range(3)
         )
         self._held_externally = np.zeros(n, np.bool_)
-        self._rows: list[tuple[int, int, int]] = []
+        self._rows: list[tuple[int, int]] = []
         self._points: list[tuple[FloatArray, FloatArray]] = []
         self._penetrations_m: list[float] = []
         self._dof = scene.model.body(scene.object_body).dofadr[0]
@@ -162,15 +160,15 @@ class _GraspRecorder:
         self._rotation[number] = data.xmat[self._bodies].reshape(-1, 3, 3)
         self._link_m[number], self._object_m[number] = data.xpos[self._bodies], data.xpos[scene.object_body]
         self._object_rotation[number] = data.xmat[scene.object_body].reshape(3, 3)
-        for body, row, point_m, force_n, penetration_m in hand_contacts(scene):
-            self._rows.append((number, row, body))
+        for _, row, point_m, force_n, penetration_m in hand_contacts(scene):
+            self._rows.append((number, row))
             self._points.append((point_m, force_n))
             self._penetrations_m.append(penetration_m)
 
     def build_record(self, hand: str) -> GraspRecord:
         """Return the record, in the palm's frame."""
         scene, rotation = self._scene, self._scene.palm_rotation
-        step, pad, body = np.array(self._rows, np.intp).reshape(-1, 3).T
+        step, pad = np.array(self._rows, np.intp).reshape(-1, 2).T
         points = np.array(self._points).reshape(-1, 2, 3)
         return GraspRecord(
             grasped_object=scene.grasp_object,
@@ -188,7 +186,6 @@ class _GraspRecorder:
             held_externally=self._held_externally,
             step_index=step,
             pad_row=pad,
-            body_id=body,
             point_m=scene.to_palm(points[:, 0]),
             force_n=points[:, 1] @ rotation,
             penetration_m=np.array(self._penetrations_m),

@@ -22,13 +22,12 @@ GROUP_SAMPLES = 5
 class BlockFeatures(NamedTuple):
     """Features of a block of m samples of n pads, in g short means.
 
-    last_sample_ns (n,). fresh_samples (n,): number of new samples. mean_counts (g, n, c) without the stored
-    offsets. trailing_repeats (n, c): equal samples in a row at the end of the block; varied (n, c): whether
-    any differed. last_counts (n, c). railed_fraction (n, c): of samples at an end of the range.
+    last_sample_ns (n,). mean_counts (g, n, c) without the stored offsets. trailing_repeats (n, c): equal
+    samples in a row at the end of the block; varied (n, c): whether any differed. last_counts (n, c).
+    railed_fraction (n, c): of samples at an end of the range.
     """
 
     last_sample_ns: NDArray[np.int64]
-    fresh_samples: NDArray[np.int64]
     mean_counts: FloatArray
     trailing_repeats: NDArray[np.int64]
     varied: NDArray[np.bool_]
@@ -57,7 +56,6 @@ def extract_features(block: HandSamples, model: DiagnosisModel, offset_counts: F
     at_end = (counts <= model.limits[:, :, 0] + near) | (counts >= model.limits[:, :, 1] - 1 - near)
     return BlockFeatures(
         block.sample_ns.max(axis=0),
-        block.fresh.sum(axis=0),
         means - offset_counts,
         repeated,
         varied,
