@@ -127,6 +127,38 @@ def test_fewer_nodes_for_nearly_log_normal_forces_give_force_and_deviation_of_ma
 
 
 HERTZ = "contact_radius_std_mm = 0.5\nhertz_force_n = 2.0"
+RADIUS_ALONE = """contact_radius_std_mm = 0.5
+contact_ohm_std = 0.0
+alpha_std = 0.0
+ohm_per_square_std = 0.0"""
+
+
+class RadiusBench:
+    """Contacts in the middle of a plane whose radius alone is uncertain, by `std_mm`."""
+
+    def __init__(self, text: str, std_mm: float) -> None:
+        text = text.replace("contact_radius_std_mm = 0.5", f"contact_radius_std_mm = {std_mm}")
+        self.model, self._sheet = build_pad_model(parse(text)), parse(text).sheets["s"]
+        network = self.model.networks[0]
+        middle = network.a / 2, network.b / 2
+        self._fractions = network.fractions(*middle)
+        self._spreading_m = float(network.spreading_radius(*middle))
+
+    def solve(
+        self, forces_n: FloatArray, deviations: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return force, deviation and status of contacts of these forces, and deviations of their radii."""
+        sheet, currents = self._sheet, []
+        radii_mm = sheet.contact_radius_mm + deviations * sheet.contact_radius_std_mm
+        for force_n, radius_mm in zip(forces_n.tolist(), radii_mm.tolist(), strict=True):
+            law = ContactLaw(
+                *(1e-6 * sheet.contact_ohm_mm2, sheet.alpha, 1e-3 * radius_mm),
+                reference_pa=1e3 * sheet.reference_kpa,
+            )
+            current = float(law.current(force_n, 5.0, sheet.ohm_per_square, self._spreading_m))
+            currents.append(current * self._fractions)
+        force, std, status = solve_each(self.model, np.array(currents)).T
+        return force, std, status
 
 
 @pytest.mark.parametrize(
@@ -145,6 +177,31 @@ def test_forces_up_to_the_greatest_one_hold_with_the_stated_probability(toleranc
     assert 0.92 < held[valid].mean() < 0.99
     for slice_ in (forces < 1, (forces > 1) & (forces < 5), forces > 5):
         assert 0.84 < held[valid & slice_].mean() <= 1.0
+
+
+@pytest.mark.parametrize(
+    "tolerances",
+    ["contact_radius_std_mm = 0.5", WIDE, RADIUS_ALONE, HERTZ],
+    ids=["default", "wide", "radius", "hertz"],
+)
+def test_intervals_hold_of_forces_just_below_the_greatest_one(tolerances: str) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {GREATEST_N}")
+    text = text.replace("contact_radius_std_mm = 0.5", tolerances)
+    forces = np.random.default_rng(5).uniform(0.6 * GREATEST_N, GREATEST_N, 800)
+    found, std, status = solve_drawn(text, forces)
+    valid = status == ForceEstimateStatus.VALID
+    assert valid.mean() > 0.9
+    assert (np.abs(found - forces) < 1.96 * std)[valid].mean() > 0.92
+
+
+@pytest.mark.parametrize("greatest_n", [10.0, 30.0])
+def test_deviations_of_forces_near_the_greatest_one_dont_jump(greatest_n: float) -> None:
+    text = TOLERANT_DEPLOYMENT.replace("alpha = 1.5", f"alpha = 1.5\nmax_force_n = {greatest_n}")
+    bench = RadiusBench(text.replace("contact_radius_std_mm = 0.5", RADIUS_ALONE), 0.5)
+    forces = np.geomspace(0.05 * greatest_n, greatest_n, 3000)
+    _, std, status = bench.solve(forces, np.zeros(forces.shape))
+    assert (status == ForceEstimateStatus.VALID).all()
+    assert np.abs(np.diff(np.log(std))).max() < 0.03
 
 
 @pytest.mark.parametrize("greatest_n", [3.0, 5.0, 11.0, 20.0, 27.0])
@@ -235,12 +292,6 @@ def test_a_growing_contact_whose_layer_no_longer_resists_gives_a_lower_bound() -
     ]
     assert (found[1:] < forces[1:]).all()
     assert np.isinf(std[1:]).all()
-
-
-RADIUS_ALONE = """contact_radius_std_mm = 0.5
-contact_ohm_std = 0.0
-alpha_std = 0.0
-ohm_per_square_std = 0.0"""
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from handtouch.core.stages.rows cimport LawRow
 cdef double _BOUND_SIGMA, _MAX_CURRENT_FRACTION, _MIN_LOG_SPREADING_RATIO, _MIN_CURRENT_A, _MIN_LEFT
 cdef double _TWO_PI, _INFINITY, _NAN, _MAX_SIGMA, _MIN_RELATIVE_VARIANCE, _MAX_SPREAD, _UNLIMITED_SIGMA
 cdef double _MAX_LOG_FORCE, _MIN_LOG_X2, _SMALL_CONTACT_REST
-cdef double _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE
+cdef double _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE, _INTERVAL_SIGMA
 cdef double _CONVERGED_SIGMA, _MIN_CROWDED_FACTOR, _TILT_REST, _CUT_TURNING, _BEND_ERROR, _CORNER_BEND_ERROR, _CUT_BEND_ERROR
 cdef double _CUT_AREA, _CUT_MORE_AREA, _CUT_SPREADING, _CUT_ERROR, _CORNER_ERROR, _CUT_REST
 cdef Py_ssize_t _CROWDING_STEPS
@@ -38,7 +38,7 @@ cdef double _find_end(StackTable stack, PadLaw law, double log_spreading_m, doub
 @cython.locals(_=Py_ssize_t)
 cdef double _find_likely(
     StackTable stack, PadLaw law, ForceResult result, double left, double least, double top) noexcept
-@cython.locals(k=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, is_far=bint)
+@cython.locals(k=Py_ssize_t, begin=Py_ssize_t, end=Py_ssize_t, is_far=bint, is_narrow=bint, cut=double, last=double, reach=double)
 cdef void _integrate(StackTable stack, PadLaw law, ForceResult result, double log_x2, double top) noexcept
 @cython.locals(k=Py_ssize_t, cut2=double)
 cdef void evaluate(StackTable stack, PadLaw law, ForceResult result, double log_x2) noexcept

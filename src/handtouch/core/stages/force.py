@@ -6,7 +6,9 @@ least mean square error over the force, as mean and median are too high where fo
 Its standard deviation is the root of the mean square difference from it. All forces up to the greatest of a
 contact are equally likely before (by their logarithm); the logarithm of the resistance that the current
 leaves is normal about that of each force, with the variance of noise, law, contact radius and distance from
-the edge at that force. So it holds near the maximum current of the sheet.
+the edge at that force. So it holds near the maximum current of the sheet. Where the current allows the
+greatest force, what is likely before decides how likely that is: there the standard deviation is at least
+such that the 95 % interval ends at the last force within 1.96 deviations of the current, by two Newton steps.
 
 The integral is over ln x^2 = ln(A^2 rho / sigma), which is linear in the logarithm of the force. The radius
 A is log-normal: mean and variance by it are those of the second-order expansion of that logarithm, whose
@@ -74,8 +76,10 @@ _MAX_NEAR_HALF, _MIN_NEAR_ROOM, _MAX_NEAR_SHIFT, _MAX_NEAR_CHANGE = 0.7, 2.0, 0.
 one, shift of the range's middle and change of its half from those of a normal one, in such halves"""
 _MIN_RELATIVE_VARIANCE = 1e-18
 _MAX_SPREAD = 4.0
-"""Mean times mean inverse of a force from which on its estimate is WIDE: open by a factor of three"""
+"""Mean times mean inverse of a force from which on its estimate is WIDE: open by a factor of three; so is one
+whose standard deviation is so many times as large as the force"""
 _UNLIMITED_SIGMA = 3.0
+_INTERVAL_SIGMA = 1.96  # of 95 %
 _MAX_LOG_FORCE, _MIN_LOG_X2 = 300.0, -300.0
 _MAX_STEPS, _CONVERGED_SIGMA = 12, 0.1
 _CROWDING_STEPS, _MIN_CROWDED_FACTOR = 4, 0.05
@@ -312,6 +316,7 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
     """Integrate over ln x^2 up to `top`, about a likely one, at which the result was evaluated."""
     power = law.parameters[0].power
     centre, half = log_x2 - result.sigma * result.step, _MAX_SIGMA * result.step
+    last = min(top, log_x2 + (_INTERVAL_SIGMA - result.sigma) * result.step)
     low = max(_MIN_LOG_X2, log_x2 - (_MAX_SIGMA + result.sigma) * result.step)
     high = min(top, log_x2 + (_MAX_SIGMA - result.sigma) * result.step)
     evaluate(stack, law, result, low)
@@ -343,7 +348,17 @@ def _integrate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: floa
         unit = math.exp(max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_unit)))
         result.force_n = unit * force
         result.std_n = unit * math.sqrt(max(mean_square, _MIN_RELATIVE_VARIANCE * force * force))
-        result.status = _FITTED if mean * inverse < _MAX_SPREAD * weights * weights else _WIDE
+        if high >= top:
+            # this sets in gradually, as the greatest force comes within the quadrature's range
+            evaluate(stack, law, result, top)
+            cut = min((_MAX_SIGMA - result.sigma) / (_MAX_SIGMA - _INTERVAL_SIGMA), 1.0)
+            evaluate(stack, law, result, last)
+            last = min(top, last + (_INTERVAL_SIGMA - result.sigma) * result.step)
+            reach = unit * (math.exp((last - log_x2) * power) - force) / _INTERVAL_SIGMA
+            if cut > 0.0 and reach > result.std_n:
+                result.std_n += cut * (reach - result.std_n)
+        is_narrow = mean * inverse < _MAX_SPREAD * weights * weights
+        result.status = _FITTED if is_narrow and result.std_n < _MAX_SPREAD * result.force_n else _WIDE
 
 
 def evaluate(stack: StackTable, law: PadLaw, result: ForceResult, log_x2: float) -> None:
