@@ -275,8 +275,10 @@ def own_rig(folder: Path, network: list[str], starter: Starter) -> Iterator[Rig]
     with own_endpoints() as endpoints:
         bus = f"can0=udp_multicast:239.74.163.2,port={find_port()}"
         made = Rig(folder, endpoints, network, [bus], starter=starter)
-        yield made
-        made.end_all()
+        try:
+            yield made
+        finally:
+            made.end_all()
 
 
 @pytest.fixture
