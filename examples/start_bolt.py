@@ -92,6 +92,8 @@ MIN_WEIGHT, MAX_STD_RAD, MAX_PRESSES = 0.95, np.radians(3.0), 10
 FORCE_N, MIN_FORCE_N = {"thumb": 4.0, "index": 2.4, "middle": 1.6}, 0.4
 _PUSHED_M, _JAMMED_M = 0.5e-3, 1.5e-3
 """Mean displacement of the fingertips by the rim, while the tip searches and at most: 0.5 N and 1.5 N"""
+_FREE_M = -0.03
+"""Place of the tip before the hole from which on nothing can push the fingertips but the bolt in the grip"""
 _SPIRAL_PITCH_M, _SPIRAL_M = 0.5e-3, 4e-3
 INSERT_M = 9e-3
 """Depth to reach, by the estimate of the bolt along the hand, which may be wrong by some millimetres"""
@@ -298,6 +300,8 @@ class BoltStarter:
             pushed_m = float(np.mean(rest - self._tips(), axis=0)[1])
             if pushed_m > _JAMMED_M:
                 forward_m -= speed
+                if forward_m < _FREE_M:
+                    return self._put_down("the fingertips stay pushed, far from the hole")
             elif pushed_m > _PUSHED_M:
                 radius = _SPIRAL_PITCH_M * angle / (2 * np.pi)
                 angle += self._robot.period_s * 6e-3 / max(radius, 0.5e-3)
