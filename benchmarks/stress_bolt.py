@@ -53,6 +53,13 @@ from start_bolt import BoltStarter, Step
 
 VARIANTS = ("truth", "handtouch", "no covariance", "no force", "binary", "nothing")
 SERVED = "daemon"
+OTHERS = {
+    "truth": "with the true pose",
+    "no covariance": "without covariances",
+    "no force": "without forces",
+    "binary": "with binary contact",
+    "nothing": "with nothing",
+}
 INSERTED_M = 5e-3
 KEPT = ROOT / "docs" / "benchmarks" / "stress_bolt.jsonl"
 PAGE, BEGIN, END = ROOT / "docs" / "bolt.md", "<!-- from `make stress ONLY=bolt` -->", "<!-- to here -->"
@@ -245,7 +252,7 @@ def statements(found: dict[Case, dict[int, Row]]) -> list[str]:
             continue
         where = f"In `{case.world}` with a clearance of {case.clearance_mm:g} mm"
         text = f"* {where} the bolt went in by touch {times(rows)}"
-        for other, name in (("truth", "with the true pose"), ("binary", "with binary contact")):
+        for other, name in OTHERS.items():
             if others := found.get(case._replace(variant=other)):
                 shared = len(set(rows) & set(others))
                 seeds = "one seed" if shared == 1 else f"{shared} seeds"
