@@ -190,12 +190,17 @@ FLOORS = {"daemon": "floor", FIRST: "floor with that priority"}
 SUMS = ("ticks", "congestion episodes", "samples missed", "overruns")
 
 
+def with_options(text: str) -> str:
+    """Return a deployment file with real-time settings."""
+    options = "".join(f"{name} = {value}\n" for name, value in OPTIONS.items())
+    return text.replace("[daemon]\n", f"[daemon]\n{options}")
+
+
 def measure(report: Report, config: Path, turns: int, seconds: float) -> None:
     """Measure daemon and floor alternately, for each motion of the contacts."""
     films = {name: film(load(config), path) for name, path in PATHS.items()}
     first = config.with_name("first.toml")
-    options = "\n".join(f"{name} = {value}" for name, value in OPTIONS.items())
-    first.write_text(config.read_text().replace("[daemon]\n", f"[daemon]\n{options}\n"))
+    first.write_text(with_options(config.read_text()))
     if troubles := realtime.check_realtime_settings(load(first).daemon):
         print(f"without: {troubles[0]}")
     rows: list[dict[str, Any]] = []
@@ -236,8 +241,7 @@ def at_rate(folder: Path, rate_hz: int) -> Path:
     config = on_loopback(folder, PORT)
     period = f"sync_period_ms = {1e3 / rate_hz:g}\n"
     text = re.sub(r"sync_period_ms = .*\n", period, config.read_text(), count=1)
-    options = "".join(f"{name} = {value}\n" for name, value in OPTIONS.items())
-    config.write_text(text.replace("[daemon]\n", f"[daemon]\n{options}"))
+    config.write_text(with_options(text))
     if realtime.check_realtime_settings(load(config).daemon):
         config.write_text(text)
     return config

@@ -3,8 +3,8 @@
 Nodes, daemon and subscribers are processes on a udp_multicast bus over loopback (in a network namespace of
 their own where that is to be had), or on vcan0 under `tests/socketcan/vcan-run`.
 
-Public names: `in_own_network`, `on_loopback`, `open_bus`, `SpacedBus`; `film`, `nodes`, `serving`,
-`daemon_process`, `bystanders`; `receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`;
+Public names: `in_own_network`, `on_loopback`, `open_bus`, `SpacedBus`; `film`, `nodes`, `PreparedAnswers`,
+`serving`, `daemon_process`, `bystanders`; `receive`, `sync_of`, `wait_for_touch`, `losses`, `stage_us`;
 `ProcessorShare`, `processor_s`, `resident_mb`, `descriptors`; `asked_of`, `in_turns`.
 """
 
@@ -16,7 +16,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -51,6 +51,8 @@ MIN_SLEEP_S = 80e-6
 """Shorter sleeps end too late by more than that"""
 FLOOR_ID = b"hand/floor"
 JOINING_S = 1.0
+HEARTBEAT_S = 0.1
+"""Heartbeat period of a node with prepared answers"""
 
 
 class SendingBus:
@@ -132,24 +134,35 @@ def nodes(config: Path, samples: NDArray[np.int64], stamps: Any, stop: Event, pr
             stop.wait()
         devices.stop()
         if prepared:
-            answer(stamped, [pad.node_id for pad in pads], samples.astype("<i2"), stop)
+            answers = PreparedAnswers(
+                [pad.node_id for pad in pads], samples, deployment.daemon.sync_period_ms
+            )
+            while not stop.is_set():
+                message = bus.recv(0.1)
+                if message is not None and message.arbitration_id == SYNC:
+                    for frame in answers.next():
+                        stamped.send(frame)
 
 
-def answer(bus: can.BusABC, node_ids: list[int], samples: NDArray[np.int16], stop: Event) -> None:
-    """Answer SYNC with samples (k, nodes, 4), one after the other, and with a heartbeat of one node."""
-    frames = [
-        [_frame(0x280 + k, own.tobytes()) for k, own in zip(node_ids, row, strict=True)] for row in samples
-    ]
-    alive = [_frame(0x700 + node_id, b"\x05") for node_id in node_ids]
-    count = 0
-    while not stop.is_set():
-        message = bus.recv(0.1)
-        if message is None or message.arbitration_id != SYNC:
-            continue
-        for frame in frames[count % len(frames)]:
-            bus.send(frame)
-        bus.send(alive[count % len(alive)])
-        count += 1
+class PreparedAnswers:
+    """What nodes answer to each SYNC, made before: samples (k, nodes, 4), one after the other, and their
+    heartbeats, in turns. `count`: SYNCs answered."""
+
+    def __init__(self, node_ids: Sequence[int], samples: NDArray[np.int64], period_ms: float) -> None:
+        self._answers = [
+            [_frame(0x280 + node_id, own.tobytes()) for node_id, own in zip(node_ids, row, strict=True)]
+            for row in samples.astype("<i2")
+        ]
+        self._alive = [_frame(0x700 + node_id, b"\x05") for node_id in node_ids]
+        self._heartbeat_syncs = max(len(node_ids), round(HEARTBEAT_S * 1e3 / period_ms))
+        self.count = 0
+
+    def next(self) -> list[can.Message]:
+        """Return the frames that answer the next SYNC."""
+        turn = self.count % self._heartbeat_syncs
+        answers = self._answers[self.count % len(self._answers)]
+        self.count += 1
+        return [*answers, self._alive[turn]] if turn < len(self._alive) else answers
 
 
 def _frame(can_id: int, data: bytes) -> can.Message:

@@ -26,7 +26,8 @@ import zmq
 from numpy.typing import NDArray
 
 from benchmarks.page import Report, options
-from benchmarks.served_hand import PATHS, film
+from benchmarks.served_hand import PATHS, PreparedAnswers, film
+from handtouch.canbus.cia301 import SYNC
 from handtouch.config import (
     Bus,
     Deployment,
@@ -52,8 +53,6 @@ LIMITS: tuple[tuple[int, int], ...] = (
 LIMIT_S = 8.0
 MISSED = 1e-3
 """Fraction of late samples or skipped periods above which a run counts as overrun"""
-HEARTBEAT_S = 0.1
-"""Heartbeat period of a node"""
 BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
 GIL_SWITCH_S = 0.0005
@@ -104,7 +103,7 @@ class Nodes:
                     devices.add(pad.node_id, serial=pad.serial)
             devices.start()
             self._simulated.append(devices)
-        self._answers = [self._answers_of(name, samples.astype("<i2")) for name in self._names]
+        self._answers = [self._answers_of(name, samples) for name in self._names]
 
     def feed(self, daemon: HandtouchDaemon) -> None:
         """Replace the simulated nodes after the daemon has booted them all."""
@@ -118,7 +117,7 @@ class Nodes:
     @property
     def answered(self) -> int:
         """Number of SYNC frames."""
-        return min(answers.count for answers in self._answers)
+        return min(answers.prepared.count for answers in self._answers)
 
     def busy_s(self) -> float:
         """Time spent answering."""
@@ -135,12 +134,11 @@ class Nodes:
         for bus in self._buses:
             bus.shutdown()
 
-    def _answers_of(self, name: str, data: NDArray[np.int16]) -> Answers:
+    def _answers_of(self, name: str, samples: NDArray[np.int64]) -> Answers:
         """Return the nodes of one bus, with samples (k, pads, 4)."""
-        numbers = [(n, pad.node_id) for n, pad in enumerate(self._pads) if pad.bus == name]
-        frames = [[frame(0x280 + node_id, row[n].tobytes()) for n, node_id in numbers] for row in data]
-        alive = [frame(0x700 + node_id, b"\x05") for _, node_id in numbers]
-        return Answers(frames, alive, max(len(alive), round(HEARTBEAT_S * 1e3 / self._period_ms)))
+        rows = [row for row, pad in enumerate(self._pads) if pad.bus == name]
+        ids = [self._pads[row].node_id for row in rows]
+        return Answers(PreparedAnswers(ids, samples[:, rows], self._period_ms))
 
 
 class Answers(queue.Queue[can.Message]):
@@ -148,31 +146,19 @@ class Answers(queue.Queue[can.Message]):
 
     inbox: Any
 
-    def __init__(
-        self, frames: list[list[can.Message]], alive: list[can.Message], heartbeat_syncs: int
-    ) -> None:
+    def __init__(self, prepared: PreparedAnswers) -> None:
         super().__init__()
-        self._frames, self._alive, self._heartbeat_syncs = frames, alive, heartbeat_syncs
-        self.count = self.busy_ns = 0
+        self.prepared, self.busy_ns = prepared, 0
 
     def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
         """Handle a frame from the daemon."""
-        if item.arbitration_id != 0x80:
+        if item.arbitration_id != SYNC:
             return
         start_ns = time.perf_counter_ns()
         put = self.inbox.put
-        for answer in self._frames[self.count % len(self._frames)]:
+        for answer in self.prepared.next():
             put(answer)
-        turn = self.count % self._heartbeat_syncs
-        if turn < len(self._alive):
-            put(self._alive[turn])
-        self.count += 1
         self.busy_ns += time.perf_counter_ns() - start_ns
-
-
-def frame(can_id: int, data: bytes) -> can.Message:
-    """Return a frame of a node."""
-    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
 
 
 def touches(pads: int, part: float) -> NDArray[np.int64]:
