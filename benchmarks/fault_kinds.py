@@ -213,11 +213,12 @@ ReportCheck = Callable[[Fault, Any], bool]
 class Kind:
     """A kind of fault.
 
-    `begin` and `end` cause and remove it; `lasts_s` are the shortest and longest time between. `reported`
-    checks that a health message of the node reports it, `reported_by_bus` that the bus statistics in
-    `service` do; with neither no report is required. `quiet`: the node must stay operational and its samples
-    valid; `loose`: the node must stay operational, but its samples are wrong, which the supervisor diagnoses.
-    `within_s` limits the time to the report, `well_s` the time to recovery.
+    `begin` and `end` cause and remove it; `lasts_s` are the shortest and longest time between. A fault with
+    `has_acted` isn't removed before that returns True. `reported` checks that a health message of the node
+    reports it, `reported_by_bus` that the bus statistics in `service` do; with neither no report is required.
+    `quiet`: the node must stay operational and its samples valid; `loose`: the node must stay operational,
+    but its samples are wrong, which the supervisor diagnoses. `within_s` limits the time to the report since
+    the beginning, or with `has_acted` since the end; `well_s` the time to recovery.
     """
 
     name: str
@@ -225,6 +226,7 @@ class Kind:
     begin: Callable[[Fault, Any], None]
     end: Callable[[Fault, Any], None]
     lasts_s: tuple[float, float] = (0.4, 1.5)
+    has_acted: Callable[[Fault], bool] | None = None
     reported: ReportCheck | None = None
     reported_by_bus: Callable[[Fault], bool] | None = None
     quiet: bool = False
@@ -342,10 +344,16 @@ def fail_at_step(code: int | None) -> Callable[[Fault, Any], None]:
     def begin(fault: Fault, bench: Any) -> None:
         with bench.devices.lock:
             server = fault.node.sdo
-            server.fail_nth = {server.requests + fault.chance.choice(BOOT_REQUESTS): code}
+            fault.kept = server.requests + fault.chance.choice(BOOT_REQUESTS)
+            server.fail_nth = {fault.kept: code}
             fault.node.reboot()
 
     return begin
+
+
+def step_reached(fault: Fault) -> bool:
+    """Return True after the request of `fail_at_step`, however long a busy machine takes to get there."""
+    return bool(fault.node.sdo.requests >= fault.kept)
 
 
 def fail_object(fault: Fault, bench: Any) -> None:
@@ -635,9 +643,9 @@ KINDS = (
          lasts_s=(4.5, 7.0), within_s=5.0, well_s=9.0,
          reported=matches("duplicate node id|identity mismatch: serial number")),
     Kind("reboot, SDO abort at a step", "faulted: refused", fail_at_step(ABORT), heal_sdo,
-         lasts_s=(0.5, 0.5), reported=_REFUSED, weight=3.0),
+         lasts_s=(0.5, 0.5), has_acted=step_reached, reported=_REFUSED, weight=3.0),
     Kind("reboot, silence at a step", "`reboots`", fail_at_step(None), heal_sdo,
-         lasts_s=(0.5, 0.5), reported=rebooted, weight=2.0),
+         lasts_s=(0.5, 0.5), has_acted=step_reached, reported=rebooted, weight=2.0),
     Kind("reboot, an object refused", "faulted: refused", fail_object, heal_sdo,
          reported=_REFUSED, well_s=7.0),
     Kind("reboot, SDO answers are noise", "faulted: 0x1018:01", garble("noise"), heal_sdo,

@@ -327,13 +327,15 @@ class Campaign:
     def _follow(self, fault: Fault, now_ns: int) -> None:
         kind, patience = fault.kind, self._asked.patience
         if not fault.ended_ns:
-            if now_ns < fault.end_ns:
+            waits = kind.has_acted is not None and not kind.has_acted(fault)
+            if now_ns < fault.end_ns + (GIVE_UP_S * S if waits else 0):
                 return
             kind.end(fault, self.bench)
             fault.ended_ns = now_ns if kind.lasts_s[1] else fault.start_ns
         expected = set(fault.nodes) if kind.reported else {0} if kind.reported_by_bus else set()
         reported = expected <= set(fault.reported_ns)
-        if not reported and now_ns - fault.start_ns > (kind.within_s * patience) * S and fault.ended_ns:
+        since_ns = fault.ended_ns if kind.has_acted else fault.start_ns
+        if not reported and now_ns - since_ns > (kind.within_s * patience) * S:
             _once(fault, "not reported")
         passed_s = (now_ns - fault.ended_ns) * 1e-9
         if kind.quiet or kind.loose or not fault.nodes:

@@ -10,15 +10,18 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import Queue
 from typing import Any
 
 import can
 import numpy as np
 import pytest
+from can.interfaces import virtual
 from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch import cli, config
+from handtouch.canbus import cia301
 from handtouch.canbus.find import survey
 from handtouch.canbus.find.survey import (
     NodeFacts,
@@ -52,6 +55,32 @@ contact_radius_std_mm = 0.5
 STANDARD = tuple(0x6401 << 16 | sub << 8 | 16 for sub in (1, 2, 3, 4))
 
 
+class RequestQueue(Queue[can.Message]):
+    """Queue of a bus on which requests are handled in their sender's thread.
+
+    All responses have arrived when `send` returns, so no time limit of a scan depends on how busy the machine
+    is. Other frames, which no node handles, are dropped: two nodes never wait for each other.
+    """
+
+    def __init__(self, handle: Callable[[can.Message], None]) -> None:
+        super().__init__()
+        self._handle = handle
+
+    def put(self, item: can.Message, block: bool = True, timeout: float | None = None) -> None:  # noqa: ARG002
+        can_id = item.arbitration_id
+        if can_id in (cia301.NMT, cia301.LSS_REQUEST) or can_id - cia301.SDO_REQUEST in range(1, 128):
+            self._handle(item)
+
+
+def handle_at_once(bus: can.BusABC, handle: Callable[[can.Message], None]) -> None:
+    """Have the requests on a virtual bus handled by a function, as `RequestQueue` does."""
+    assert isinstance(bus, virtual.VirtualBus)
+    with virtual.channels_lock:
+        bus.channel.remove(bus.queue)
+        bus.queue = RequestQueue(handle)
+        bus.channel.append(bus.queue)
+
+
 class VirtualBus:
     """A virtual bus with nodes, and a listener that receives all frames."""
 
@@ -69,7 +98,9 @@ class VirtualBus:
 
     def nodes(self) -> DeviceBus:
         """A host of nodes, with samples for 128."""
-        host = DeviceBus(self.open(), lambda _: np.zeros((128, 4), np.int16))
+        bus = self.open()
+        host = DeviceBus(bus, lambda _: np.zeros((128, 4), np.int16))
+        handle_at_once(bus, lambda frame: host.handle_frame(frame, time.monotonic_ns()))
         self._hosts.append(host)
         return host
 
@@ -383,16 +414,10 @@ def test_a_refused_identity_is_no_mismatch(wire: VirtualBus) -> None:
 def test_an_invalid_sdo_response_is_not_called_a_missing_one(wire: VirtualBus) -> None:
     """Neither to the probe, whatever its length, nor to a later request."""
     expected = deployment(wire, 3)
-    ends = [
-        answering(wire, 0x11, lambda _: bytes.fromhex("4310")),
-        answering(wire, 0x12, lambda request: b"\x43\xff\xff" + request[3:]),
-        answering(wire, 0x13, lambda request: b"\x43\0\x10" + bytes(5) if request[1] == 0 else b"\x21" * 8),
-    ]
-    try:
-        reports = scan_buses(expected.buses, QUICK)
-    finally:
-        for end in ends:
-            end()
+    add_answering(wire, 0x11, lambda _: bytes.fromhex("4310"))
+    add_answering(wire, 0x12, lambda request: b"\x43\xff\xff" + request[3:])
+    add_answering(wire, 0x13, lambda request: b"\x43\0\x10" + bytes(5) if request[1] == 0 else b"\x21" * 8)
+    reports = scan_buses(expected.buses, QUICK)
     found = problems(expected, reports)
     probed = "invalid SDO response to the request for 0x1000:00: "
     assert found[0x11] == f"{probed}43 10"
@@ -403,20 +428,17 @@ def test_an_invalid_sdo_response_is_not_called_a_missing_one(wire: VirtualBus) -
     assert "no SDO response" not in text
 
 
-def answering(wire: VirtualBus, node_id: int, answer: Callable[[bytes], bytes | None]) -> Callable[[], None]:
-    """Run a node whose SDO server is `answer`."""
+def add_answering(wire: VirtualBus, node_id: int, answer: Callable[[bytes], bytes | None]) -> can.BusABC:
+    """Add a node whose SDO server is `answer`; it ends with the bus returned."""
     bus = wire.open()
 
-    def serve(stop: threading.Event) -> None:
-        while not stop.is_set():
-            request = bus.recv(0.05)
-            data = (
-                answer(bytes(request.data)) if request and request.arbitration_id == 0x600 + node_id else None
-            )
-            if data is not None:
-                bus.send(can.Message(arbitration_id=0x580 + node_id, data=data, is_extended_id=False))
+    def serve(request: can.Message) -> None:
+        data = answer(bytes(request.data)) if request.arbitration_id == 0x600 + node_id else None
+        if data is not None:
+            bus.send(can.Message(arbitration_id=0x580 + node_id, data=data, is_extended_id=False))
 
-    return on_thread(serve)
+    handle_at_once(bus, serve)
+    return bus
 
 
 def test_endless_sdo_transfer_does_not_block_the_scan(
@@ -429,11 +451,8 @@ def test_endless_sdo_transfer_does_not_block_the_scan(
             return bytes((0x40,)) + request[1:4] + bytes(4)
         return bytes((request[0] & 0x10,)) + b"for ever"[:7] if request[0] & 0xE0 == 0x60 else None
 
-    end = answering(wire, 9, endless)
-    try:
-        (report,) = scan_buses([wire.bus], QUICK)
-    finally:
-        end()
+    add_answering(wire, 9, endless)
+    (report,) = scan_buses([wire.bus], QUICK)
     (node,) = report.nodes
     assert "no answer" in node.error
 
@@ -446,13 +465,11 @@ def test_scan_ends_whatever_nodes_answer(wire: VirtualBus) -> None:
 
         return babble
 
-    ends = [answering(wire, 9 + seed, babbling(random.Random(seed))) for seed in range(4)]
-    try:
-        reports = scan_buses([wire.bus], QUICK)
-    finally:
-        for end in ends:
-            end()
-    assert len(compare_nodes(None, reports)) == len(reports[0].nodes) <= len(ends)
+    buses = [add_answering(wire, 9 + seed, babbling(random.Random(seed))) for seed in range(4)]
+    reports = scan_buses([wire.bus], QUICK)
+    for bus in buses:
+        bus.shutdown()
+    assert len(compare_nodes(None, reports)) == len(reports[0].nodes) <= len(buses)
     assert cli.main(["scan", "--bus", wire.option, "--seconds", "0.05"]) == 1  # the nodes have stopped
 
 
