@@ -21,9 +21,8 @@ from handtouch.canbus.bus.port import BusError, Port, open_bus
 from handtouch.client import key_maker
 from handtouch.config import shipped
 from handtouch.core.slab import Slab
-from handtouch.host.machine import Machine
+from handtouch.host.machine import HostCheck, Machine
 from handtouch.procedures import doctor
-from handtouch.procedures.doctor import HostCheck
 
 HAND = shipped.path("utah_mit.toml")
 

@@ -9,9 +9,9 @@ import pytest
 
 from handtouch import config
 from handtouch.config import shipped
-from handtouch.host.machine import Machine
+from handtouch.host.machine import HostCheck, Machine
 from handtouch.procedures import doctor
-from handtouch.procedures.timing_checks import TimingFact, check_timing, parse_cpus
+from handtouch.procedures.timing_checks import check_timing, parse_cpus
 
 
 def machine(root: Path, **files: str) -> Machine:
@@ -28,8 +28,8 @@ def deployment(**of_daemon: Any) -> config.Deployment:
     return stated.model_copy(update={"daemon": stated.daemon.model_copy(update=of_daemon)})
 
 
-def facts(stated: config.Deployment, on: Machine) -> dict[str, TimingFact]:
-    return {fact.subject: fact for fact in check_timing(stated, on)}
+def checks(stated: config.Deployment, on: Machine) -> dict[str, HostCheck]:
+    return {check.subject: check for check in check_timing(stated, on)}
 
 
 def test_a_prepared_machine_has_nothing_to_improve(tmp_path: Path) -> None:
@@ -42,9 +42,9 @@ def test_a_prepared_machine_has_nothing_to_improve(tmp_path: Path) -> None:
         sys__class__net__can0__device__irq="45",
         proc__irq__45__smp_affinity_list="0-1",
     )
-    found = facts(deployment(cpus=(3,), realtime_priority=40), prepared)
+    found = checks(deployment(cpus=(3,), realtime_priority=40), prepared)
     assert set(found) == {"kernel", "governor", "CPUs", "interrupts"}
-    assert all(fact.is_good for fact in found.values())
+    assert all(check.state == "ok" for check in found.values())
 
 
 @pytest.mark.parametrize(
@@ -61,9 +61,9 @@ def test_each_thing_that_delays_the_loop_comes_with_its_remedy(
     tmp_path: Path, file: str, text: str, subject: str, remedy: str
 ) -> None:
     on = machine(tmp_path, **{"sys__class__net__can0__device__irq": "45", file: text})
-    fact = facts(deployment(cpus=(3,), realtime_priority=40), on)[subject]
-    assert not fact.is_good
-    assert remedy in fact.remedy
+    check = checks(deployment(cpus=(3,), realtime_priority=40), on)[subject]
+    assert check.state == "warn"
+    assert remedy in check.remedy
 
 
 def test_only_a_deployment_that_asks_for_real_time_is_warned(tmp_path: Path) -> None:
@@ -81,8 +81,10 @@ def test_an_adapter_with_a_queue_per_interrupt_has_each_checked(tmp_path: Path) 
         proc__irq__45__smp_affinity_list="0",
         proc__irq__46__smp_affinity_list="3",
     )
-    found = [fact.is_good for fact in check_timing(deployment(cpus=(3,)), on) if fact.subject == "interrupts"]
-    assert found == [True, False]
+    found = [
+        check.state for check in check_timing(deployment(cpus=(3,)), on) if check.subject == "interrupts"
+    ]
+    assert found == ["ok", "warn"]
 
 
 def test_lists_of_cpus_are_read_as_the_kernel_writes_them() -> None:

@@ -1,6 +1,7 @@
 """Facts about this machine and this process: kernel parameters, network, routes, resources in use.
 
-Public names: `Machine`, `check_multicast_route`, `NoRouteError`, `process_statistics` (for `service`).
+Public names: `Machine`, `HostCheck`, `CheckState`, `check_multicast_route`, `NoRouteError`,
+`process_statistics` (for `service`).
 """
 
 from __future__ import annotations
@@ -16,12 +17,23 @@ import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from handtouch.host.logs import BoundedLogHandler
 
+CheckState = Literal["ok", "warn", "fail"]
 _NET_ADMIN_BIT = 12
 _ANY_PORT = 9
+
+
+@dataclass(frozen=True)
+class HostCheck:
+    """Result of one check, with a remedy where it isn't ok."""
+
+    subject: str
+    state: CheckState
+    detail: str
+    remedy: str = ""
 
 
 class NoRouteError(OSError):

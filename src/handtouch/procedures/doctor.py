@@ -1,7 +1,7 @@
 """Checks of this machine for running the daemon: packages, clock, buffers, CAN interfaces, endpoints, keys.
 
-Public names: `check_host`, `HostCheck`. Read-only: nothing is configured and no frame is sent. Without a
-deployment only the machine and the default endpoints are checked.
+Public names: `check_host`. Read-only: nothing is configured and no frame is sent. Without a deployment only
+the machine and the default endpoints are checked.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ import re
 import socket
 import sys
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import zmq
 
@@ -28,10 +27,9 @@ from handtouch.core.compiled import Compilation
 from handtouch.host import realtime
 from handtouch.host.endpoints import to_connect
 from handtouch.host.installation import compile_command, extra_command
-from handtouch.host.machine import Machine, NoRouteError, check_multicast_route
+from handtouch.host.machine import CheckState, HostCheck, Machine, NoRouteError, check_multicast_route
 from handtouch.procedures.timing_checks import check_timing
 
-CheckState = Literal["ok", "warn", "fail"]
 _ENDPOINT_IN_USE_REMEDY = (
     "stop the daemon that uses it (`handtouch status`), or choose another endpoint in [daemon]"
 )
@@ -39,16 +37,6 @@ _NO_ADDRESS_REMEDY = "name an address or interface of this machine in [daemon] (
 _DAEMON_TIMEOUT_S = 0.5
 """Time for a running daemon to answer; it takes milliseconds"""
 FAST_CLOCK_SOURCES = ("tsc", "arch_sys_counter", "kvm-clock")
-
-
-@dataclass(frozen=True)
-class HostCheck:
-    """Result of one check, with a remedy where it isn't ok."""
-
-    subject: str
-    state: CheckState
-    detail: str
-    remedy: str = ""
 
 
 def check_host(deployment: config.Deployment | None, machine: Machine | None = None) -> Iterator[HostCheck]:
@@ -65,12 +53,7 @@ def check_host(deployment: config.Deployment | None, machine: Machine | None = N
     yield from check_endpoints(daemon, hands)
     yield from check_keys(daemon)
     yield from check_realtime(daemon)
-    wants_realtime = bool(daemon.realtime_priority or daemon.cpus)
-    for fact in check_timing(deployment, machine):
-        if fact.is_good or not wants_realtime:
-            yield HostCheck(fact.subject, "ok", fact.detail)
-        else:
-            yield HostCheck(fact.subject, "warn", fact.detail, fact.remedy)
+    yield from check_timing(deployment, machine)
 
 
 def check_realtime(daemon: config.Daemon) -> Iterator[HostCheck]:

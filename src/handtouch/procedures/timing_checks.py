@@ -8,26 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 from handtouch import config
-from handtouch.host.machine import Machine
+from handtouch.host.machine import HostCheck, Machine
 
 _STEADY_GOVERNOR = "performance"
 
 
-class TimingFact(NamedTuple):
-    """What is found, and how to have it better; `is_good` where nothing is to be done."""
-
-    subject: str
-    is_good: bool
-    detail: str
-    remedy: str = ""
-
-
-def check_timing(deployment: config.Deployment | None, machine: Machine) -> Iterator[TimingFact]:
+def check_timing(deployment: config.Deployment | None, machine: Machine) -> Iterator[HostCheck]:
     """Yield kernel, frequencies, reserved CPUs, and interrupts of SocketCAN adapters."""
     daemon = deployment.daemon if deployment else config.Daemon()
+    wants_realtime = bool(daemon.realtime_priority or daemon.cpus)
+    for check in _check_each(deployment, daemon, machine):
+        yield check if wants_realtime else HostCheck(check.subject, "ok", check.detail)
+
+
+def _check_each(
+    deployment: config.Deployment | None, daemon: config.Daemon, machine: Machine
+) -> Iterator[HostCheck]:
     yield _kernel(machine)
     if (governors := _governors(machine, daemon.cpus)) is not None:
         yield governors
@@ -47,18 +45,18 @@ def parse_cpus(text: str) -> set[int]:
     return found
 
 
-def _kernel(machine: Machine) -> TimingFact:
+def _kernel(machine: Machine) -> HostCheck:
     if _read(machine.sys / "kernel/realtime") == "1":
-        return TimingFact("kernel", True, "PREEMPT_RT")
-    return TimingFact(
+        return HostCheck("kernel", "ok", "PREEMPT_RT")
+    return HostCheck(
         "kernel",
-        False,
+        "warn",
         "not a real-time kernel: other work delays the loop by up to milliseconds",
         "install one: linux-image-rt-amd64 (Debian), `pro enable realtime-kernel` (Ubuntu)",
     )
 
 
-def _governors(machine: Machine, cpus: Iterable[int]) -> TimingFact | None:
+def _governors(machine: Machine, cpus: Iterable[int]) -> HostCheck | None:
     """Return how frequencies are chosen, of the loop's CPUs or of all; None where the kernel doesn't."""
     folder, wanted = machine.sys / "devices/system/cpu", set(cpus)
     found = {
@@ -69,22 +67,22 @@ def _governors(machine: Machine, cpus: Iterable[int]) -> TimingFact | None:
     if not chosen:
         return None
     if chosen == [_STEADY_GOVERNOR]:
-        return TimingFact("governor", True, _STEADY_GOVERNOR)
+        return HostCheck("governor", "ok", _STEADY_GOVERNOR)
     text = f"{', '.join(chosen)}: a CPU that waits for frames slows down, and the next tick is late"
-    return TimingFact("governor", False, text, f"cpupower frequency-set -g {_STEADY_GOVERNOR}")
+    return HostCheck("governor", "warn", text, f"cpupower frequency-set -g {_STEADY_GOVERNOR}")
 
 
-def _reserved(machine: Machine, cpus: tuple[int, ...]) -> TimingFact:
+def _reserved(machine: Machine, cpus: tuple[int, ...]) -> HostCheck:
     names = ",".join(map(str, cpus))
     isolated = parse_cpus(_read(machine.sys / "devices/system/cpu/isolated"))
     if shared := sorted(set(cpus) - isolated):
         text = f"any process may run on CPU {', '.join(map(str, shared))} of [daemon] cpus"
         remedy = f"boot with isolcpus={names} nohz_full={names} rcu_nocbs={names}"
-        return TimingFact("CPUs", False, text, remedy)
-    return TimingFact("CPUs", True, f"{names} reserved by isolcpus")
+        return HostCheck("CPUs", "warn", text, remedy)
+    return HostCheck("CPUs", "ok", f"{names} reserved by isolcpus")
 
 
-def _interrupts(machine: Machine, name: str, cpus: tuple[int, ...]) -> Iterator[TimingFact]:
+def _interrupts(machine: Machine, name: str, cpus: tuple[int, ...]) -> Iterator[HostCheck]:
     """Yield the CPUs that serve an adapter's interrupts; nothing for one without its own, as on USB."""
     device = machine.sys / "class/net" / name / "device"
     numbers = [path.name for path in sorted(device.glob("msi_irqs/*"))]
@@ -97,17 +95,17 @@ def _interrupts(machine: Machine, name: str, cpus: tuple[int, ...]) -> Iterator[
         served, detail = parse_cpus(text), f"{name}: interrupt {number} on CPU {text}"
         others = sorted(served - set(cpus))
         if not served & set(cpus):
-            yield TimingFact("interrupts", True, detail)
+            yield HostCheck("interrupts", "ok", detail)
         elif others:
             target = ",".join(map(str, others))
-            yield TimingFact(
+            yield HostCheck(
                 "interrupts",
-                False,
+                "warn",
                 f"{detail}, which [daemon] cpus reserves for the loop",
                 f"echo {target} > /proc/irq/{number}/smp_affinity_list, and stop irqbalance",
             )
         else:
-            yield TimingFact("interrupts", False, f"{detail}, as the loop", "choose another CPU for either")
+            yield HostCheck("interrupts", "warn", f"{detail}, as the loop", "choose another CPU for either")
 
 
 def _read(path: Path) -> str:
