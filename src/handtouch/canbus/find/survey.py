@@ -138,7 +138,7 @@ class BusSurvey:
         """Read the nodes with these ids; `progress` is called with the number read so far."""
         if not ids:
             return []
-        self._readers = {node_id: SdoTransport(node_id, self.port.send_patiently) for node_id in ids}
+        self._readers = {node_id: self._transport(node_id) for node_id in ids}
         with ThreadPoolExecutor(MAX_READERS, "sdo") as pool:
             jobs = [
                 pool.submit(_read_node, node_id, NodeSdoClient(transport))
@@ -152,6 +152,11 @@ class BusSurvey:
         self.receive(0.01)  # for a second node's response to the last request
         self._readers = {}
         return [self._merge_traffic(job.result()) for job in jobs]
+
+    def _transport(self, node_id: int) -> SdoTransport:
+        """Return an SDO channel on which what arrived in time counts, however late it is read."""
+        port = self.port
+        return SdoTransport(node_id, port.send_patiently, received_until_ns=lambda: port.received_until_ns)
 
     def observed_facts(self, node_id: int) -> NodeFacts:
         """Return what is known of a node that was not probed, or doesn't respond."""
