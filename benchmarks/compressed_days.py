@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from benchmarks.daemon_settings import InlineProcess
+from benchmarks.diagnose_episodes import draw_fault, size_mm
 from benchmarks.page import progress
 from benchmarks.served_hand import descriptors, resident_mb
 from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
@@ -44,7 +45,6 @@ from handtouch.daemon.supervisor_client import SupervisorClient
 from handtouch.host.build import build_info
 from handtouch.record.mcap_file import RecordingFile
 from handtouch.record.recorder import MessageRecorder, RotationLimits
-from handtouch.simulate.episodes import pad_size_mm
 from handtouch.simulate.faults import FAULTS
 from handtouch.simulate.stimulus import NodeReplacement
 from handtouch.simulate.worlds import WORLDS, MountSpread, World
@@ -139,7 +139,8 @@ class Days:
     def _add_fault(self, kind: str, at: float, rng: np.random.Generator) -> None:
         pad = int(rng.integers(len(self.use.links)))
         settings = self.use.deployment.pads[pad][1]
-        fault = FAULTS[kind].draw(rng, settings.link, at, pad_size_mm(settings))
+        keys = draw_fault(kind.replace("_", " "), rng, size_mm(settings))
+        fault = FAULTS[kind].model_validate({"link": settings.link, "from_s": at, **keys})
         until_s = at + float(rng.uniform(*FAULT_S))
         self.use.faults.append(fault.model_copy(update={"until_s": until_s}))
         self.acts.append(Act(kind, at, until_s, pad))

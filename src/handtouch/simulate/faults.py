@@ -1,18 +1,16 @@
 """Faults of a pad as physics: each changes the sheet, its wiring, or its channels.
 
-A fault class declares its `kind`, the keys of its `[[fault]]` table, its effects, and how to draw one at
-random; everything else follows from the class. Public names: `Fault` and its subclasses, `FAULTS` (by kind),
-`INFLUENCES` (not faults, but with similar effects), `AnyFault` (any of them, as a scenario file has it),
-`electrode_index`, `draw_position`.
+A fault class declares its `kind`, the keys of its `[[fault]]` table and its effects; everything else follows
+from the class. Public names: `Fault` and its subclasses, `FAULTS` (by kind), `INFLUENCES` (not faults, but
+with similar effects), `AnyFault` (any of them, as a scenario file has it), `electrode_index`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +26,7 @@ from handtouch.wire.faults import FaultKind
 Fraction = Annotated[float, Field(ge=0.02, le=0.98)]
 Channel = Annotated[str, Field(pattern=r"^(x0|xa|y0|yb|t[1-9][0-9]?)$")]
 Corner = Literal["x0y0", "x0yb", "xay0", "xayb"]
-Size = tuple[float, float]
 
-_CORNERS = ("x0y0", "x0yb", "xay0", "xayb")
 _LEAK_POINTS = 13
 _GOLDEN_ANGLE_RAD = np.pi * (3 - 5**0.5)
 
@@ -63,17 +59,6 @@ class Fault(Table):
         """Return the class's `kind`."""
         kind: FaultKind = cls.model_fields["kind"].default
         return kind
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator, link: str, from_s: float, size_mm: Size) -> Self:
-        """Draw a lasting fault of a severity that matters, on a pad with sides `size_mm`."""
-        drawn = cls.draw_keys(rng, size_mm)
-        return cls.model_validate({"link": link, "from_s": from_s, **drawn})
-
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
-        """Draw the keys that are the kind's own."""
-        raise NotImplementedError(f"{cls.__name__} can't be drawn")
 
     @model_validator(mode="after")
     def _check_interval(self) -> Self:
@@ -131,20 +116,6 @@ class Gum(Fault):
     )
     relax_s: Positive = Field(60.0, description="time constant of the relaxation")
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
-        """Draw the keys that are the kind's own."""
-        force_n = log_uniform(rng, 0.15, 1.5)
-        return {
-            "place": draw_position(rng),
-            "radius_mm": float(rng.uniform(0.06, 0.16)) * min(size_mm),
-            "force_n": force_n,
-            "press_n": force_n * float(rng.uniform(1.5, 5)),
-            "press_s": float(rng.uniform(0.4, 2)),
-            "relax": float(rng.uniform(0, 0.25)),
-            "relax_s": float(rng.uniform(20, 200)),
-        }
-
     def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts:  # noqa: ARG002
         """Return one disc."""
         elapsed = np.maximum(times_s - self.from_s, 0.0)
@@ -166,16 +137,6 @@ class Moisture(Fault):
     leak_ohm: Positive = Field(5000.0, description="resistance between the layers over the whole wet area")
     grow_s: Positive = Field(30.0, description="time constant of the growing leak")
     dry_s: Positive = Field(120.0, description="time constant of drying after the end")
-
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
-        """Draw the keys that are the kind's own."""
-        return {
-            "place": draw_position(rng, 0.2),
-            "radius_mm": float(rng.uniform(0.2, 0.5)) * min(size_mm),
-            "leak_ohm": log_uniform(rng, 2e3, 3e4),
-            "grow_s": log_uniform(rng, 10, 60),
-        }
 
     def contacts(self, times_s: FloatArray, size_m: tuple[float, float]) -> FaultContacts:
         """Return discs spread evenly over the part of the area that lies on the pad."""
@@ -202,11 +163,6 @@ class DeadElectrode(Fault):
     electrode: Channel = Field(description="electrode whose wire is broken")
     open_ohm: Positive = Field(1e9, description="resistance of the break")
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        return {"electrode": draw_electrode(rng)}
-
     def modify_wiring(self, wiring: Wiring) -> None:
         """Add the break to the electrode's resistor."""
         wiring.series_ohm[electrode_index(self.electrode)] += self.open_ohm
@@ -223,13 +179,6 @@ class ShortedElectrode(Fault):
         50.0,
         description="input resistance of each amplifier, which divides the current of two shorted electrodes",
     )
-
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        one, other = rng.permutation(SIDE_ELECTRODES)[:2].tolist()
-        to = "layer" if rng.random() < 0.5 else other
-        return {"electrode": one, "to": to, "short_ohm": log_uniform(rng, 0.5, 20)}
 
     @model_validator(mode="after")
     def _check_other_electrode(self) -> Self:
@@ -256,14 +205,6 @@ class SwappedCables(Fault):
         description="electrodes found on the channels of x0, xa, y0, yb"
     )
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        order = list(SIDE_ELECTRODES)
-        i, j = rng.permutation(4)[:2].tolist()
-        order[i], order[j] = order[j], order[i]
-        return {"order": tuple(order)}
-
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if set(self.order) != set(SIDE_ELECTRODES) or self.order == SIDE_ELECTRODES:
@@ -283,11 +224,6 @@ class SaturatedChannel(Fault):
     electrode: Channel = Field(description="electrode of the channel")
     high: bool = Field(True, description="true: at the upper end; false: at the lower")
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        return {"electrode": draw_electrode(rng), "high": bool(rng.random() < 0.8)}
-
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to its limit."""
         channel = electrode_index(self.electrode)
@@ -300,12 +236,6 @@ class StuckChannel(Fault):
     kind: Literal[FaultKind.STUCK_CHANNEL] = FaultKind.STUCK_CHANNEL
     electrode: Channel = Field(description="electrode of the channel")
     count: int | None = Field(None, description="the count; left out: the reading when it got stuck")
-
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        count = int(rng.integers(-2000, 20_000)) if rng.random() < 0.3 else None
-        return {"electrode": draw_electrode(rng), "count": count}
 
     def override_counts(self, counts: NDArray[np.int64], limits: NDArray[np.int64]) -> None:
         """Set the channel to the count."""
@@ -322,12 +252,6 @@ class TornCorner(Fault):
     along_x_mm: NonNegative = Field(description="lost length of the side along x")
     along_y_mm: NonNegative = Field(description="lost length of the side along y")
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:
-        """Draw the keys that are the kind's own."""
-        x_mm, y_mm = (float(rng.uniform(0.2, 0.5)) * side for side in size_mm)
-        return {"corner": str(rng.choice(_CORNERS)), "along_x_mm": x_mm, "along_y_mm": y_mm}
-
     @property
     def cut_corner(self) -> tuple[Corner, float, float]:
         """Corner, and the lost lengths of its sides [m]."""
@@ -341,12 +265,6 @@ class Offset(Fault):
     electrode: Channel = Field(description="electrode of the channel")
     counts: float = Field(description="size of the step")
 
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        counts = log_uniform(rng, 60, 3000) * float(rng.choice([-1, 1]))
-        return {"electrode": draw_electrode(rng), "counts": counts}
-
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Add the offset."""
         counts[:, electrode_index(self.electrode)] += self.counts
@@ -359,12 +277,6 @@ class GainStep(Fault):
     kind: Literal[FaultKind.GAIN_STEP] = FaultKind.GAIN_STEP
     electrode: Channel = Field(description="electrode of the channel")
     factor: Positive = Field(description="new gain relative to the old one")
-
-    @classmethod
-    def draw_keys(cls, rng: np.random.Generator, size_mm: Size) -> dict[str, Any]:  # noqa: ARG003
-        """Draw the keys that are the kind's own."""
-        factor = log_uniform(rng, 1.15, 2.0) ** float(rng.choice([-1, 1]))
-        return {"electrode": draw_electrode(rng), "factor": factor}
 
     def distort_counts(self, counts: FloatArray) -> FloatArray:
         """Apply the new gain."""
@@ -405,19 +317,3 @@ def electrode_index(electrode: str) -> int:
     if electrode not in SIDE_ELECTRODES:
         return int(electrode.removeprefix("t")) - 1
     return SIDE_ELECTRODES.index(electrode)
-
-
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform."""
-    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
-
-
-def draw_electrode(rng: np.random.Generator) -> str:
-    """Draw an electrode's name."""
-    return str(rng.choice(SIDE_ELECTRODES))
-
-
-def draw_position(rng: np.random.Generator, margin: float = 0.12) -> tuple[float, float]:
-    """Draw a position (x, y) as fractions of a pad, at least `margin` from its sides."""
-    x, y = rng.uniform(margin, 1 - margin, 2).tolist()
-    return x, y
