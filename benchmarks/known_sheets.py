@@ -26,7 +26,6 @@ from handtouch.simulate.worlds import DrawnWorld
 FloatArray = NDArray[np.float64]
 _RADII, _FORCES = 81, 160
 _LOG_FORCES = np.log(np.geomspace(0.01, 60.0, _FORCES))
-_REACH = 4.0  # of radii, in standard deviations
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from benchmarks.page import OUT, keep_run_time, run_time
 ROOT = Path(__file__).parents[1]
 OUTPUT = ROOT / "build" / "measured"
 SIDE_BY_SIDE = (
-    "diagnose", "worlds", "contacts", "grasp", "electrodes", "diagnose_cases", "supervise", "gains", "slip",
-    "swap", "shear_slip", "stability", "estimate", "percept_grasp", "object", "shear", "design", "switched",
+    "diagnose", "worlds", "contacts", "grasp", "electrodes", "diagnose_cases", "supervise", "slip",
+    "swap", "shear_slip", "stability", "percept_grasp", "object", "shear", "design", "switched",
     "shape",
 )  # fmt: skip
 """Benchmarks of errors and events, whose figures don't depend on what else runs (processor times aside); the

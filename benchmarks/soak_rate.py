@@ -57,7 +57,6 @@ BOOT_PERIOD_NS = 50_000_000
 SAMPLES = 1000
 GIL_SWITCH_S = 0.0005
 """Switch interval that `handtouch run` sets"""
-REPORT_PERIOD_S = 15.0
 
 
 def hands_of(pads: int, rate_hz: float, folder: Path) -> Deployment:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PROGRAMS = sorted(
     path for kind in ("bench", "soak", "stress") for path in (ROOT / "benchmarks").glob(f"{kind}_*.py")
 )
-CHEAP = ("bench_network",)
+CHEAP = ("bench_shape",)
 """Programs whose quick pass takes two seconds; the others are too long for a test."""
 
 

@@ -41,7 +41,7 @@ from handtouch.calibration.contact_scores import (
 from handtouch.field.estimate import estimate
 from handtouch.field.model import ForwardModel, FractionModel, channel_noise
 
-# Constants without an origin beside them were chosen; docs/benchmarks/gains.md measures what they yield.
+# Constants without an origin beside them were chosen; docs/benchmarks/swap.md measures what they yield.
 BATCH_CONTACTS = 32
 MAX_SHAPE_DEVIATION = 20.0
 """Standard deviation of a log gain after 400 contacts, per noise, above which a shape is refused."""
