@@ -178,7 +178,7 @@ def quiet_piece(world: str, piece: int) -> list[Row]:
             continue
         for t_s, row in zip(times_s.tolist(), counts, strict=True):
             began[bench.run_tick(row, round(1e9 * t_s)).began] += 1
-        touched_s += bench.tick.contacts.touching * (times_s[-1] - times_s[0])
+        touched_s += bench.tick.state.touching * (times_s[-1] - times_s[0])
     shape = (len(FACTORS), -1)
     return [
         {"factor": factor, "false": count, "touched_s": lasted}

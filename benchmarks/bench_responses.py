@@ -211,7 +211,7 @@ class TickDriver:
         return 1e-3 * (time.thread_time_ns() - begin_ns)
 
     def check(self) -> None:
-        assert np.count_nonzero(self._tick.contacts.touching) == self._touched
+        assert np.count_nonzero(self._tick.state.touching) == self._touched
 
 
 def measure_ticks(asked: Namespace) -> None:

@@ -159,7 +159,7 @@ def held(world: str, name: str, seconds: float) -> Rows:
         elif number >= total - 200:
             late.append(rig.tick.columns.force_n[:HELD].copy())
         if number >= 20:
-            lost |= set(np.flatnonzero(~rig.tick.contacts.touching[:HELD]).tolist())
+            lost |= set(np.flatnonzero(~rig.tick.state.touching[:HELD]).tolist())
     off = np.mean(late, axis=0) / np.mean(early, axis=0) - 1
     begun = rig.tick.contacts.begun_count
     for _ in range(round(60e9 / PERIOD_NS)):
@@ -172,7 +172,7 @@ def held(world: str, name: str, seconds: float) -> Rows:
             "rms": f"{100 * float(np.sqrt(np.mean(off**2))):.2f} %",
             "contacts ever lost, of five": len(lost),
             "false contacts": int(begun - HELD),
-            "not released after": int(np.count_nonzero(rig.tick.contacts.touching[:HELD])),
+            "not released after": int(np.count_nonzero(rig.tick.state.touching[:HELD])),
         }
     ]
 
@@ -267,7 +267,7 @@ def slow(quick: bool) -> Rows:
             press = none.copy()
             press[0] = per_law * force**1.5
             rig.step(press)
-            if math.isnan(found) and rig.tick.contacts.touching[0]:
+            if math.isnan(found) and rig.tick.state.touching[0]:
                 found = force
         taken = float(rig.tick.baseline.expected_counts[0].sum()) / press[0]
         rows.append(

@@ -73,7 +73,7 @@ class Driver:
                 part()
                 if number >= 10:
                     spent[name].append(time.perf_counter_ns() - begin_ns)
-        assert np.count_nonzero(self.tick.contacts.touching) == self.touched
+        assert np.count_nonzero(self.tick.state.touching) == self.touched
         return {name: float(np.median(times)) * 1e-3 for name, times in spent.items()}
 
 

@@ -498,7 +498,7 @@ def compare(
     pipeline: Pipeline, truth: list[tuple[int, FloatArray, float]], faulty: set[int], whole: Compared
 ) -> None:
     """Compare published positions with the truth of this tick."""
-    columns, touching = pipeline.tick.columns, pipeline.tick.contacts.touching
+    columns, touching = pipeline.tick.columns, pipeline.tick.state.touching
     for row, position_m, _ in truth:
         if not touching[row] or row in faulty:
             continue

@@ -169,7 +169,7 @@ def measured_thresholds(hands: Sequence[QuietHand], period_ns: int) -> list[Thre
             for row, sync_ns in zip(counts[part], stamps[part].tolist(), strict=True):
                 bench.run_tick(row, sync_ns)
             levels = (counts[part] - bench.tick.baseline.expected_counts).sum(axis=2)
-            touched = np.broadcast_to(bench.tick.contacts.touching, levels.shape)
+            touched = np.broadcast_to(bench.tick.state.touching, levels.shape)
             scatter.add_block(stamps[part], levels, ~touched, touched)
     least = [least_begin_counts(std, scatter.samples_per_s) for std in scatter.counts.tolist()]
     begin_n = [bench.model.centre_force(pad, counts) for pad, counts in enumerate(least)]

@@ -120,7 +120,7 @@ class Recorder(PerceptPublisher):
         rows = rows[tick.slip.contact_id[rows] > 0]
         if len(rows):
             features = SlipEvidence(self._poses, tick.slip, _PERIOD_S).features(rows)
-            self.kept.append((result.sync_ns, rows, tick.contacts.id[rows].astype(np.intp), features))
+            self.kept.append((result.sync_ns, rows, tick.state.contact_id[rows].astype(np.intp), features))
 
 
 def deployment() -> Deployment:

@@ -413,13 +413,13 @@ class Fuzz:
             (known.all(axis=0) | ~valid) & (np.isfinite(published["force_n"]) | ~shown) & either.all(axis=0)
         )
         finite.check(kept, among(rows))
-        saturated = np.asarray(tick.contacts.saturated).reshape(size, -1).sum(axis=1)
+        saturated = np.asarray(tick.contacts.saturated_channels).reshape(size, -1).sum(axis=1)
         located = self.counts_of - saturated >= 3
         rows = np.flatnonzero(is_new & (saturated > 0))
         at_top.check((~shown & (located | ~valid))[rows], among(rows))
         bottom = self.pipeline.slab.limits[:, : self.model.channels]
         rows = np.flatnonzero(((tick.counts <= bottom) & self._used).any(axis=1))
-        at_bottom.check(~np.asarray(tick.contacts.touching, np.bool_)[rows], among(rows))
+        at_bottom.check(~np.asarray(tick.state.touching, np.bool_)[rows], among(rows))
         rows = np.flatnonzero(np.isfinite(columns.position_m[:, 0]) & is_new)
         covariance.check(self._covariance_is_positive(rows), among(rows))
         rows = np.flatnonzero(shown)

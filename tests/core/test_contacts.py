@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from handtouch.config import Touch
-from handtouch.core.contacts import ContactChanges, ContactDetector, DetectionSettings
 from handtouch.core.memory import rows_by_name
-from handtouch.core.pipeline import detect_contacts
 from handtouch.core.slab import Cycle, Slab
+from handtouch.core.stages.detect import ContactChanges, ContactDetector, DetectionSettings
 from handtouch.core.stages.rows import TOUCH_ROW
 from handtouch.core.state import TickState
 
@@ -22,15 +21,15 @@ class Detector:
     """Contacts of one pad with a baseline of 0 and 1 A per count; debounces of so many cycles' samples."""
 
     def __init__(self, begin: int = 2, end: int = 3, *, period_ns: int = 10, delay_ns: int = 0) -> None:
-        one, self._state, self._slab = np.ones(1), TickState.empty(1), Slab(1)
-        self._state.max_sample_period_ns[:] = period_ns
+        one, self.state, self._slab = np.ones(1), TickState.empty(1), Slab(1)
+        self.state.max_sample_period_ns[:] = period_ns
         self._cycle, self._up, self._period_ns = Cycle(period_ns, 0.6), np.zeros(1, np.uint8), period_ns
         touch = Touch(begin_ms=1e-5 * (begin - 1), end_ms=1e-5 * (end - 1), max_gap_periods=10)
         settings = DetectionSettings(
             *(np.ones((1, 4)), one, one, BEGIN * one, END * one, rows_by_name(TOUCH_ROW, [touch])),
             np.array([delay_ns]),
         )
-        self.contacts = ContactDetector(settings, np.zeros((1, 4)), self._state)
+        self.contacts = ContactDetector(settings, np.zeros((1, 4)), self.state)
 
     def step(self, level: float, sampled: bool = True, trusted: bool = True) -> ContactChanges:
         """Run a cycle; a pad that isn't trusted is at the end of its range."""
@@ -40,21 +39,21 @@ class Detector:
         if sampled or not trusted:
             self._slab.write_pdo(0, counts.tobytes(), self._cycle.sync_ns + 1)
         self._slab.unpack_counts()
-        return detect_contacts(self.contacts, self._slab, self._up, self._cycle)
+        return self.contacts.detect_contacts(self._slab, self._up, self._cycle)
 
 
 def test_a_contact_begins_after_the_debounce_with_the_time_of_its_first_sample() -> None:
     detector = Detector(begin=3)
     began = [len(detector.step(30).began) for _ in range(4)]
     assert began == [0, 0, 1, 0]
-    assert detector.contacts.begin_ns[0] == 10
+    assert detector.state.begin_ns[0] == 10
 
 
 def test_a_sample_of_a_node_that_samples_by_itself_is_dated_by_its_delay_before_its_sync() -> None:
     detector = Detector(begin=3, delay_ns=4)
     began = [len(detector.step(30).began) for _ in range(4)]
     assert began == [0, 0, 1, 0]
-    assert detector.contacts.begin_ns[0] == 10 - 4
+    assert detector.state.begin_ns[0] == 10 - 4
 
 
 @pytest.mark.parametrize(("period_ns", "samples"), [(1, 11), (2, 6), (9, 2), (11, 2), (40, 2)])
@@ -107,10 +106,10 @@ def test_begins_and_ends_alternate_and_no_id_is_used_twice(steps: list[tuple[int
     for level, sampled, trusted in steps:
         changes = detector.step(level, sampled, trusted)
         if len(changes.began):
-            events.append(("begin", int(detector.contacts.id[0])))
+            events.append(("begin", int(detector.state.contact_id[0])))
         if len(changes.ended):
-            events.append(("end", int(detector.contacts.id[0])))
-            detector.contacts.id[changes.ended] = 0
+            events.append(("end", int(detector.state.contact_id[0])))
+            detector.state.contact_id[changes.ended] = 0
     assert [event for event, _ in events] == ["begin", "end"] * (len(events) // 2) + ["begin"] * (
         len(events) % 2
     )

@@ -182,7 +182,7 @@ def test_nothing_is_solved_or_encoded_without_a_subscriber(bench: Any) -> None:
     rig = TouchedPads(bench, SceneRequest())
     assert rig.run(6) == []
     assert not rig.solved
-    assert rig.pipeline.tick.contacts.touching.all()  # contacts are detected
+    assert rig.pipeline.tick.state.touching.all()  # contacts are detected
     rig.subscriptions = frozenset([b"contact/h/round"])
     rig.run(6)
     assert rig.solved == {1}

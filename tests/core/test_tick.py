@@ -128,7 +128,7 @@ def test_a_contact_survives_a_gap_of_ten_periods(driver: Driver, missing: int) -
     touch = {PLANE: driver.bench.counts(PLANE, 0.5, 0.5, 1e-3)}
     driver.step(touch)
     driver.step(touch)
-    position, contact_id = driver.tick.columns.position_m[PLANE].copy(), driver.tick.contacts.id[PLANE]
+    position, contact_id = driver.tick.columns.position_m[PLANE].copy(), driver.tick.state.contact_id[PLANE]
     for number in range(missing):
         result = driver.step({}, silent=(PLANE,))
         assert (result.silent.tolist(), result.updated.tolist(), result.ended.tolist()) == ([PLANE], [], [])
@@ -136,7 +136,7 @@ def test_a_contact_survives_a_gap_of_ten_periods(driver: Driver, missing: int) -
         np.testing.assert_array_equal(driver.tick.columns.position_m[PLANE], position)
     result = driver.step(touch)
     assert (result.silent.tolist(), result.updated.tolist()) == ([], [PLANE])
-    assert driver.tick.contacts.id[PLANE] == contact_id
+    assert driver.tick.state.contact_id[PLANE] == contact_id
 
 
 def test_a_contact_ends_with_the_eleventh_missing_sample(driver: Driver) -> None:
@@ -223,7 +223,7 @@ def test_a_contact_begins_at_the_sync_of_its_late_sample(driver: Driver) -> None
     driver.slab.write_pdo(PLANE, touch.tobytes(), driver.t_ns + 4_000_000)  # after the tick
     driver.step({PLANE: touch}, silent=(PLANE,))
     assert driver.step({PLANE: touch}).began.tolist() == [PLANE]
-    assert driver.tick.contacts.begin_ns[PLANE] == first_ns
+    assert driver.tick.state.begin_ns[PLANE] == first_ns
 
 
 def test_a_channel_that_sources_current_is_a_fault_and_no_contact(driver: Driver) -> None:

@@ -307,7 +307,7 @@ def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
     served.counts[0] = 400
     for _ in range(4):
         served.tick()
-    contact = int(served.pipeline.tick.contacts.id[0])
+    contact = int(served.pipeline.tick.state.contact_id[0])
     _change_sheet(served)
     answer = served.ask("reload")
     assert answer["ok"], answer
@@ -320,7 +320,7 @@ def test_reload_keeps_calibrations_and_contacts(served: Bench) -> None:
     assert model.calibrations[1].calibration_id == "c1"
     assert (served.pipeline.tick.baseline.expected_counts[1] > 0.5).all()  # it falls to the readings of 0
     assert model.calibrations[0].calibration_id == model.default_calibration_ids[0]
-    assert int(served.pipeline.tick.contacts.id[0]) == contact
+    assert int(served.pipeline.tick.state.contact_id[0]) == contact
     assert model.begin_threshold_a[0] != 0
     assert served.ask("reload")["tables"] == []  # the new file is applied already
 

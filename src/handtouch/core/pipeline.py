@@ -1,6 +1,6 @@
 """Path of a sample: from the slab to the messages of a tick, driven by a live bus or by a recording.
 
-Public names: `Pipeline`; `run_tick`, `detect_contacts`, `solve_contacts`, stages of its ticks.
+Public names: `Pipeline`; `run_tick`, `solve_contacts`, stages of its ticks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from handtouch import wire
 from handtouch.arrays import FloatArray, IntArray
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.columns import TickResult
-from handtouch.core.contacts import ContactChanges, ContactDetector
 from handtouch.core.events import CalibrationEvent, DemandEvent, Event, ForceEvent, GravityEvent, ModelEvent
 from handtouch.core.hand_poses import HandPoses
 from handtouch.core.journal import TickJournal
@@ -30,8 +29,6 @@ from handtouch.hand.robot_models import RobotModels
 from handtouch.wire import PadState
 
 _NO_LIMIT_NS = np.iinfo(np.int64).max
-_NO_PADS: IntArray = np.zeros(0, dtype=np.intp)
-_NO_CHANGES = ContactChanges(*[_NO_PADS] * len(ContactChanges._fields))
 
 
 class Pipeline:
@@ -228,7 +225,7 @@ class Pipeline:
         tick = self.tick
         everything = np.ones(self.model.size, dtype=np.bool_)
         tick.set_requested(everything, everything, self.state.update_interval_ticks)
-        touching = np.flatnonzero(tick.contacts.touching)
+        touching = np.flatnonzero(tick.state.touching)
         if len(touching):
             solve_contacts(tick, touching)
             tick.sheet_force.store_forces()
@@ -272,7 +269,7 @@ def run_tick(
     """
     tick.channel_counts, tick.sync_ns = slab.unpack_counts(), cycle.sync_ns
     tick.counts = tick.channel_counts[:, : tick.model.channels]
-    changes = detect_contacts(tick.contacts, slab, node_state, cycle, until_ns)
+    changes = tick.contacts.detect_contacts(slab, node_state, cycle, until_ns)
     if len(changes.began):
         tick.sheet_force.begin_contacts(changes.began)
         tick.second.begin_contacts(changes.began)
@@ -290,35 +287,6 @@ def run_tick(
     began, ended, updated, silent, _, framed = changes
     return TickResult(
         sync_ns=cycle.sync_ns, began=began, updated=updated, ended=ended, silent=silent, framed=framed
-    )
-
-
-def detect_contacts(
-    contacts: ContactDetector,
-    slab: Slab,
-    node_state: NDArray[np.uint8],
-    cycle: Cycle,
-    until_ns: int = _NO_LIMIT_NS,
-) -> ContactChanges:
-    """Compute the currents of samples that arrived before `until_ns`, and detect contacts on pads whose
-    `node_state` (n,) is 0.
-
-    A contact on a pad without valid samples ends at once; one that misses a sample keeps its state.
-    """
-    stage = contacts.stage
-    stage.detect_contacts(
-        slab.memory,
-        node_state.data,
-        cycle.sync_ns,
-        cycle.previous_sync_ns,
-        cycle.period_ns // 2,
-        until_ns,
-    )
-    counts = stage.began, stage.ended, stage.updated, stage.silent, stage.solved, stage.framed
-    if not any(counts):
-        return _NO_CHANGES
-    return ContactChanges(
-        *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(contacts.lists, counts, strict=True)]
     )
 
 

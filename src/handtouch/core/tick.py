@@ -13,11 +13,11 @@ from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline, BaselineSettings
 from handtouch.core.columns import PadColumns, TickResult
 from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, make_solver
-from handtouch.core.contacts import ContactDetector, DetectionSettings
 from handtouch.core.pad_model import PadModel
 from handtouch.core.second_sheets import SecondSheets
 from handtouch.core.shear_pads import changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
+from handtouch.core.stages.detect import ContactDetector, DetectionSettings
 from handtouch.core.stages.publish import ContactColumns
 from handtouch.core.stages.shear import ShearForces, ShearTable
 from handtouch.core.stages.slip import SlipDetector
@@ -58,7 +58,7 @@ class TickProcessor:
             self.columns.values,
             self.columns.total_current_a,
             self.columns.sample_ns,
-            self.contacts.id,
+            held.contact_id,
             held=held,
         )
         """slip and lift-off of contacts, where requested"""
@@ -125,7 +125,7 @@ class TickProcessor:
 
     def update_force_gains(self, reference: ForceReference) -> int:
         """Compare forces with an external measurement; return the number of pads whose gain was updated."""
-        return self.sheet_force.update_gains(reference, self.state.sample_ns, self.contacts.touching)
+        return self.sheet_force.update_gains(reference, self.state.sample_ns, self.state.touching)
 
     def replace_model(self, model: PadModel, changed: IntArray) -> None:
         """Continue with another model of the same pads, `changed` of which differ; contacts continue."""
@@ -164,13 +164,13 @@ class TickProcessor:
         columns, self._tables = self.columns, list(model.forward_tables)
         self.second.make_stage(model, self.sheet_force)
         measured = {
-            "saturated": self.contacts.saturated,
+            "saturated": self.contacts.saturated_channels,
             "noise_squared": self.state.noise_squared,
             "misfits": self.state.misfits,
         }
         self.solver = make_solver(
             model,
-            currents=self.contacts.currents,
+            currents=self.contacts.currents_a,
             offset_std_a=self.contacts.offset_std_a,
             force_requested=self._estimate_force,
             values=columns.values,
@@ -197,7 +197,7 @@ class TickProcessor:
         if self.second.any_configured:
             self.second.prepare_next_tick(self.sync_ns)
         if self.sync_ns:
-            self.baseline.update_baseline(self.sync_ns, self.contacts.touching)
+            self.baseline.update_baseline(self.sync_ns, self.state.touching)
 
 
 def _baseline_settings(model: PadModel) -> BaselineSettings:

@@ -102,11 +102,11 @@ class TickMessages:
 
     def end_all_contacts(self, now_ns: int, sink: MessageSink) -> None:
         """Send the end of every contact, because the daemon stops."""
-        touching = np.flatnonzero(self._tick.contacts.touching)
+        touching = np.flatnonzero(self._tick.state.touching)
         self._end_reason = _STOPPED
         none = np.zeros(0, dtype=np.intp)
         self.send_contacts(TickResult(now_ns, none, none, touching, none), now_ns, sink)
-        self._tick.contacts.touching[:] = False
+        self._tick.state.touching[:] = False
         self._tick.columns.state[:] = PadState.STARTING
 
     def send_hand_frames(self, slab: Slab, tick_number: int, sync_ns: int, sink: MessageSink) -> None:
@@ -129,7 +129,7 @@ class TickMessages:
         }
 
     def _retained_contact(self, pad: int, now_ns: int) -> wire.EncodedMessage | None:
-        if not self._tick.contacts.touching[pad]:
+        if not self._tick.state.touching[pad]:
             return None
         return self._contact_message(pad, "update", 0, now_ns, retained=True)
 
@@ -175,7 +175,7 @@ class TickMessages:
         columns = self._tick.columns
         return {
             "state": columns.state[rows],
-            "contact_id": self._tick.contacts.id[rows],
+            "contact_id": self._tick.state.contact_id[rows],
             "sample_ns": columns.sample_ns[rows],
             "position_status": columns.position_status[rows],
             "force_status": columns.force_status[rows],

@@ -43,7 +43,7 @@ class BlockBuffer:
         self._fresh[k] = pipeline.slab.fresh.view(np.bool_)
         self._fresh[k] &= pipeline.slab.arrival_ns == tick.state.arrival_ns
         self._state[k] = tick.columns.state
-        self._contact_id[k] = tick.contacts.id
+        self._contact_id[k] = tick.state.contact_id
         self._count = k + 1
         if self._count < self.max_ticks and self._sync_ns[k] - self._sync_ns[0] < _MAX_BLOCK_NS:
             return None

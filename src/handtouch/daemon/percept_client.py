@@ -181,7 +181,7 @@ class PerceptClient:
         log_odds = slip[:, SLIP_SLICES["log_odds"]]
         log_odds[slip[:, SLIP_SLICES["slipping"]] != 0] = np.inf
         log_odds[tick.slip.contact_id[rows] == 0] = np.nan
-        ids = np.where(self._pads[hand_rows], tick.contacts.id[hand_rows], 0)
+        ids = np.where(self._pads[hand_rows], tick.state.contact_id[hand_rows], 0)
         return wire.PerceptInput(
             v=wire.SCHEMA_VERSION,
             session=0,

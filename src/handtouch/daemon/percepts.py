@@ -89,7 +89,7 @@ class PerceptPublisher:
         tick, transforms = self._pipeline.tick, self._pipeline.transforms
         if not transforms.any_requested:
             return
-        sample = ContactSamples(rows, tick.columns.sample_ns[rows], tick.contacts.id[rows])
+        sample = ContactSamples(rows, tick.columns.sample_ns[rows], tick.state.contact_id[rows])
         placed, rotation, _, joints_m2 = transforms.in_palm(rows)
         sample["position_m"], sample["pad_m"] = tick.columns.position_m[rows], tick.columns.pad_m[rows]
         sample["total_current_a"] = tick.columns.total_current_a[rows]

@@ -178,7 +178,7 @@ class SupervisorClient:
 
     def process_tick(self, now_ns: int) -> None:
         """Add a tick to the block; send complete blocks and apply the results that were received."""
-        touching = self._pipeline.tick.contacts.touching
+        touching = self._pipeline.tick.state.touching
         if self.excitation.is_due(now_ns, touching):
             self._update_excitation(now_ns, touching)
         if self.process.pid is None:

@@ -75,7 +75,7 @@ class TareJob:
         for pad in np.flatnonzero(new).tolist():
             self._levels[pad].append(int(tick.counts[pad].sum()))
         # a load since the start, of unknown zeros, is what the user says it is: none
-        self._touched |= tick.contacts.touching & tick.state.known
+        self._touched |= tick.state.touching & tick.state.known
         self._all_sum += tick.channel_counts * new[:, None]
         self._saturated |= self._pipeline.slab.saturated(tick.channel_counts) & new[:, None]
         if now_ns < self._end_ns:

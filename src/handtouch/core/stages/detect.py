@@ -1,16 +1,27 @@
 """Samples of a tick to contacts: currents, validity, two thresholds and a debounce; one pass over the pads.
 
-Public name: `ContactDetection`.
+Public names: `ContactDetector`, `DetectionSettings`, `ContactChanges`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from handtouch.core.memory import view_memory
 from handtouch.core.stages.receive import SampleMemory
 from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.wire.status import MAX_SILENT_PERIODS, PadState
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from handtouch.arrays import FloatArray, IntArray
+    from handtouch.core.memory import RowArray
+    from handtouch.core.pad_model import PadModel
+    from handtouch.core.slab import Cycle, Slab
+    from handtouch.core.state import TickState
 
 _VALUES = VALUE_COUNT
 _CLEAR, _TOUCHED, _STALE, _, _FAULTED, _STARTING, _ = map(int, PadState)
@@ -19,39 +30,74 @@ _MAX_NEGATIVE_SIGMA, _MAX_NEGATIVE_FRACTION = 10.0, 0.02  # of a channel's noise
 _MAX_NEGATIVE_AMPLITUDES = 2.0  # of hum and noise
 _MAX_ZERO_FRACTION = 0.02  # of a channel's range: an amplifier's offset is less, if it isn't broken
 _NAN = float("nan")
+_NO_LIMIT_NS = (1 << 63) - 1
+_NO_PADS = np.zeros(0, dtype=np.intp)
 
 
-class ContactDetection:
-    """Detection of contacts on n pads, at most one each.
+class DetectionSettings(NamedTuple):
+    """Settings of n pads, read in place in every tick."""
 
-    arrays: flat memory of the arrays of `TickState` by their names; of the model: ampere_per_count (n c),
-    mean_ampere_per_count and noise_counts (n,), begin_threshold_a and end_threshold_a (n,), sample_delay_ns
-    (n,) and touch, (n,) TOUCH_ROWs; expected_counts (n c) of untouched pads.
-    Written for the solver: currents (n c,), saturated (n c,), 1 for a channel at the top of its range, and
-    offset_std_a (n,), the standard deviation of the sums of the currents from the baseline [A].
+    ampere_per_count: FloatArray
+    """(n, channels)"""
+    mean_ampere_per_count: FloatArray
+    """(n,)"""
+    noise_counts: FloatArray
+    """(n,) of a channel"""
+    begin_threshold_a: FloatArray
+    """(n,) a contact begins above it"""
+    end_threshold_a: FloatArray
+    """(n,) a contact ends below it"""
+    touch: RowArray
+    """(n,) TOUCH_ROWs"""
+    sample_delay_ns: NDArray[np.int64]
+    """(n,) from a sample to its SYNC, or to its arrival where it is event-driven"""
+
+    @classmethod
+    def of_model(cls, model: PadModel) -> DetectionSettings:
+        """Return those of a model, which has them by the same names."""
+        return cls(*(getattr(model, name) for name in cls._fields))
+
+
+class ContactChanges(NamedTuple):
+    """Pads whose contact began or ended in one tick, continues with a new sample (`updated`) or without the
+    expected one (`silent`), those whose contact is to be solved, and those whose new sample only a hand frame
+    needs (`framed`)."""
+
+    began: IntArray
+    ended: IntArray
+    updated: IntArray
+    silent: IntArray
+    solved: IntArray
+    framed: IntArray
+
+
+_NO_CHANGES = ContactChanges(*[_NO_PADS] * len(ContactChanges._fields))
+
+
+class ContactDetector:
+    """Detection of contacts on n pads, at most one each, in a tick's state.
+
+    expected_counts: (n, c) of untouched pads, read in place.
+    Written for the solver: `currents_a` (n, c), `saturated_channels` (n, c), those at the top of their range,
+    and `offset_std_a` (n,), the standard deviation of the sums of the currents from the baseline [A].
     c is the number of electrodes of the pad that has most; those that a pad lacks have no current. Further
     channels of the slab are those of shear pads, whose currents never end: they are no part of a contact.
-
-    lists: (n,) each, pads whose contact began, ended, has a new sample and didn't begin, misses one, is to be
-    solved, or has a new sample that only a hand frame needs; `began`, `ended`, `updated`, `silent`, `solved`
-    and `framed` of them.
     """
 
-    def __init__(self, pads: int, arrays: Mapping[str, Any], lists: Sequence[memoryview[int]]) -> None:
-        self.pads = pads
-        self.began_pads, self.ended_pads, self.updated_pads = lists[:3]
-        self.silent_pads, self.solved_pads, self.framed_pads = lists[3:]
+    def __init__(self, settings: DetectionSettings, expected_counts: FloatArray, state: TickState) -> None:
+        arrays, self.pads, self.channels = state.memory, state.pads, expected_counts.shape[1]
+        # of a tick
+        self.lists = [np.zeros(state.pads, np.intp) for _ in ContactChanges._fields]
+        self.began_pads, self.ended_pads, self.updated_pads = map(view_memory, self.lists[:3])
+        self.silent_pads, self.solved_pads, self.framed_pads = map(view_memory, self.lists[3:])
         self.began = self.ended = self.updated = self.silent = self.solved = self.framed = 0
+        self.currents_a, self.offset_std_a = np.zeros_like(expected_counts), np.zeros(state.pads)
+        self.saturated_channels = np.zeros(expected_counts.shape, dtype=np.bool_)
+        self.currents, self.sum_std_a = view_memory(self.currents_a), view_memory(self.offset_std_a)
+        self.saturated = view_memory(self.saturated_channels)
         # model
-        self.expected_counts, self.currents = arrays["expected_counts"], arrays["currents"]
-        self.saturated = arrays["saturated"]
-        self.channels = len(self.currents) // pads
-        self.ampere_per_count, self.noise_counts = arrays["ampere_per_count"], arrays["noise_counts"]
-        self.mean_ampere_per_count = arrays["mean_ampere_per_count"]
-        self.offset_std, self.offset_std_a = arrays["offset_std"], arrays["offset_std_a"]
-        self.begin_threshold_a = arrays["begin_threshold_a"]
-        self.end_threshold_a = arrays["end_threshold_a"]
-        self.touch, self.sample_delay_ns = arrays["touch"], arrays["sample_delay_ns"]
+        self.expected_counts = view_memory(expected_counts)
+        self.set_settings(settings)
         # samples
         self.ticks = arrays["ticks"]
         self.pad_state, self.sample_ns = arrays["pad_state"], arrays["sample_ns"]
@@ -71,6 +117,7 @@ class ContactDetection:
         self.update_interval_ticks = arrays["update_interval_ticks"]
         self.ticks_per_hand_frame = arrays["ticks_per_hand_frame"]
         # baseline
+        self.offset_std = arrays["offset_std"]
         self.held, self.block_sum = arrays["held"], arrays["block_sum"]
         self.block_squares, self.block_count = arrays["block_squares"], arrays["block_count"]
         self.span_sum, self.span_squares = arrays["span_sum"], arrays["span_squares"]
@@ -81,47 +128,86 @@ class ContactDetection:
         self.known = arrays["known"]
         # of one pad
         self.sampled = self.implausible = self.trusted = self.stale = self.zeroing = self.railed = False
-        self.excess = arrays["excess"]
+        self.excess = view_memory(np.zeros(state.channels))
+
+    def set_settings(self, settings: DetectionSettings) -> None:
+        """Change the settings; they apply to present contacts too."""
+        self.ampere_per_count = view_memory(settings.ampere_per_count)
+        self.mean_ampere_per_count = view_memory(settings.mean_ampere_per_count)
+        self.noise_counts = view_memory(settings.noise_counts)
+        self.begin_threshold_a = view_memory(settings.begin_threshold_a)
+        self.end_threshold_a = view_memory(settings.end_threshold_a)
+        self.touch, self.sample_delay_ns = settings.touch, view_memory(settings.sample_delay_ns)
+
+    @property
+    def begun_count(self) -> int:
+        """Number of contacts begun so far."""
+        return int(self.next_contact_id[0]) - 1
 
     def detect_contacts(
-        self,
-        memory: SampleMemory,
-        node_state: memoryview[int],
-        sync_ns: int,
-        previous_sync_ns: int,
-        half_period_ns: int,
-        until_ns: int,
-    ) -> None:
-        """Process the samples that arrived before `until_ns`. node_state: (n,), 0 where the node is up."""
-        self.began = self.ended = self.updated = self.silent = self.solved = self.framed = 0
-        self.ticks[0] += 1
-        for pad in range(self.pads):
-            _take_sample(self, memory, pad, node_state[pad] == 0, sync_ns, previous_sync_ns, until_ns)
-            _check_sample(self, memory, pad)
-            _check_silence(self, pad, sync_ns - previous_sync_ns, half_period_ns)
-            if node_state[pad] != 0:
-                self.trusted = False
-            _detect_contact(self, pad, half_period_ns)
-            if node_state[pad] != 0:
-                self.pad_state[pad] = node_state[pad]
-            elif self.stale:
-                self.pad_state[pad] = _STALE
-            elif self.implausible:
-                self.pad_state[pad] = _FAULTED
-            elif self.touching[pad]:
-                self.pad_state[pad] = _TOUCHED
-            elif self.zeroing and self.known[pad] == 0:
-                self.pad_state[pad] = _STARTING
-            elif self.pad_state[pad] <= _TOUCHED or self.contradicting_samples[pad] == 0:
-                self.pad_state[pad] = _CLEAR
-            else:  # back with a current that may begin a contact
-                self.pad_state[pad] = _STARTING
-            if self.sampled:
-                _count_sample(self, pad)
+        self, slab: Slab, node_state: NDArray[np.uint8], cycle: Cycle, until_ns: int = _NO_LIMIT_NS
+    ) -> ContactChanges:
+        """Compute the currents of samples that arrived before `until_ns`, and detect contacts on pads whose
+        `node_state` (n,) is 0.
+
+        A contact on a pad without valid samples ends at once; one that misses a sample keeps its state.
+        """
+        _detect_contacts(
+            self,
+            slab.memory,
+            node_state.data,
+            cycle.sync_ns,
+            cycle.previous_sync_ns,
+            cycle.period_ns // 2,
+            until_ns,
+        )
+        counts = self.began, self.ended, self.updated, self.silent, self.solved, self.framed
+        if not any(counts):
+            return _NO_CHANGES
+        return ContactChanges(
+            *[pads[:k].copy() if k else _NO_PADS for pads, k in zip(self.lists, counts, strict=True)]
+        )
+
+
+def _detect_contacts(
+    stage: ContactDetector,
+    memory: SampleMemory,
+    node_state: memoryview[int],
+    sync_ns: int,
+    previous_sync_ns: int,
+    half_period_ns: int,
+    until_ns: int,
+) -> None:
+    """Process the samples that arrived before `until_ns`. node_state: (n,), 0 where the node is up."""
+    stage.began = stage.ended = stage.updated = stage.silent = stage.solved = stage.framed = 0
+    stage.ticks[0] += 1
+    for pad in range(stage.pads):
+        _take_sample(stage, memory, pad, node_state[pad] == 0, sync_ns, previous_sync_ns, until_ns)
+        _check_sample(stage, memory, pad)
+        _check_silence(stage, pad, sync_ns - previous_sync_ns, half_period_ns)
+        if node_state[pad] != 0:
+            stage.trusted = False
+        _detect_contact(stage, pad, half_period_ns)
+        if node_state[pad] != 0:
+            stage.pad_state[pad] = node_state[pad]
+        elif stage.stale:
+            stage.pad_state[pad] = _STALE
+        elif stage.implausible:
+            stage.pad_state[pad] = _FAULTED
+        elif stage.touching[pad]:
+            stage.pad_state[pad] = _TOUCHED
+        elif stage.zeroing and stage.known[pad] == 0:
+            stage.pad_state[pad] = _STARTING
+        elif stage.pad_state[pad] <= _TOUCHED or stage.contradicting_samples[pad] == 0:
+            stage.pad_state[pad] = _CLEAR
+        else:  # back with a current that may begin a contact
+            stage.pad_state[pad] = _STARTING
+        if stage.sampled:
+            _count_sample(stage, pad)
 
 
 def _take_sample(
-    stage: ContactDetection,
+    stage: ContactDetector,
     memory: SampleMemory,
     pad: int,
     operational: bool,
@@ -147,7 +233,7 @@ def _take_sample(
         stage.missed_sample_counts[pad] += 1
 
 
-def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> None:
+def _check_sample(stage: ContactDetector, memory: SampleMemory, pad: int) -> None:
     """Compute a pad's currents. Its sample is implausible with a channel at the bottom of its range, sourcing
     current, or at the top while the others are at rest.
 
@@ -188,7 +274,7 @@ def _check_sample(stage: ContactDetection, memory: SampleMemory, pad: int) -> No
         stage.total_current_a[pad] = total
 
 
-def _sources(stage: ContactDetection, pad: int, total: float, magnitude: float) -> bool:
+def _sources(stage: ContactDetector, pad: int, total: float, magnitude: float) -> bool:
     """Return True if channels source current beyond noise, hum, and what a contact's own gains may do.
 
     A sheet only sinks current. If all channels source, by no more than begins a contact, the baseline is
@@ -204,7 +290,7 @@ def _sources(stage: ContactDetection, pad: int, total: float, magnitude: float) 
     return sources and (drains or -total > stage.begin_threshold_a[pad] * stage.threshold_factor[pad])
 
 
-def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period_ns: int) -> None:
+def _check_silence(stage: ContactDetector, pad: int, cycle_ns: int, half_period_ns: int) -> None:
     """Add the cycle to the silence of a pad without a sample: it is stale after three periods."""
     stage.stale = False
     if stage.sampled:
@@ -218,7 +304,7 @@ def _check_silence(stage: ContactDetection, pad: int, cycle_ns: int, half_period
         stage.trusted = False
 
 
-def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> None:
+def _detect_contact(stage: ContactDetector, pad: int, half_period_ns: int) -> None:
     """Begin, continue or end a pad's contact; one on a pad that isn't trusted ends at once.
 
     Times of SYNCs vary, so half a period less than the debounce is enough; one sample is not.
@@ -245,7 +331,7 @@ def _detect_contact(stage: ContactDetection, pad: int, half_period_ns: int) -> N
         _select(stage, pad, touching, _is_above(stage, pad, level, True))
 
 
-def _is_above(stage: ContactDetection, pad: int, level: float, touching: bool) -> bool:
+def _is_above(stage: ContactDetector, pad: int, level: float, touching: bool) -> bool:
     """Return True if a current is above the threshold that applies."""
     factor: float = stage.threshold_factor[pad]
     begin_a: float = stage.begin_threshold_a[pad]
@@ -253,7 +339,7 @@ def _is_above(stage: ContactDetection, pad: int, level: float, touching: bool) -
     return level >= factor * end_a if touching else level > factor * begin_a
 
 
-def _begin_contact(stage: ContactDetection, pad: int) -> None:
+def _begin_contact(stage: ContactDetector, pad: int) -> None:
     """Begin a contact. The samples that its baseline collected last may be its approach."""
     stage.touching[pad] = stage.held[pad] = 1
     if stage.next_contact_id[0] & 0xFFFFFFFF == 0:  # 0 is no contact
@@ -272,13 +358,13 @@ def _begin_contact(stage: ContactDetection, pad: int) -> None:
     stage.began += 1
 
 
-def _end_contact(stage: ContactDetection, pad: int) -> None:
+def _end_contact(stage: ContactDetector, pad: int) -> None:
     stage.touching[pad] = stage.contradicting_samples[pad] = 0
     stage.ended_pads[stage.ended] = pad
     stage.ended += 1
 
 
-def _select(stage: ContactDetection, pad: int, continued: bool, above: bool) -> None:
+def _select(stage: ContactDetector, pad: int, continued: bool, above: bool) -> None:
     """List a pad's contact if it is to be updated or solved, or its sample is missing.
 
     A hand frame has the values of its samples, also of pads that are updated less often. A sample below the
@@ -298,12 +384,12 @@ def _select(stage: ContactDetection, pad: int, continued: bool, above: bool) -> 
             stage.framed_pads[stage.framed] = pad
             stage.framed += 1
         if stage.position_requested[pad]:
-            stage.offset_std_a[pad] = stage.offset_std[pad] * stage.mean_ampere_per_count[pad]
+            stage.sum_std_a[pad] = stage.offset_std[pad] * stage.mean_ampere_per_count[pad]
             stage.solved_pads[stage.solved] = pad
             stage.solved += 1
 
 
-def _count_sample(stage: ContactDetection, pad: int) -> None:
+def _count_sample(stage: ContactDetector, pad: int) -> None:
     """Count a sample, and collect that of an untouched pad for its baseline, unless a contact may begin."""
     stage.sample_counts[pad] += 1
     free = stage.trusted and not stage.touching[pad]
