@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from handtouch.config import SurfaceTable, surface_table
-from handtouch.core.pad_tables import SurfacePatches
+from handtouch.core.stages.tables import PadSurface
 from handtouch.field import BoundaryElectrode, Outline, OutlineNetwork
 from handtouch.field.network import SIDES, Electrode, ElectrodeNetwork
 from handtouch.field.surface_base import Surface
@@ -86,11 +86,11 @@ def test_drawing_and_rectangle_are_inverse_maps(kind: str) -> None:
 @kinds
 def test_contacts_are_placed_to_a_thousandth_of_the_pad(kind: str) -> None:
     surface = OUTLINE_TABLES[kind].build()
-    patches = SurfacePatches.from_surface(surface, np.eye(3), np.zeros(3))
-    cells = patches.nodes.shape[1] - 1
+    nodes = PadSurface(surface, np.eye(3), np.zeros(3)).nodes
+    cells = nodes.shape[1] - 1
     at = (np.arange(cells) + 0.5) / cells
     x, y = np.meshgrid(surface.a * at, surface.b * at)
-    value, by_x, by_y, by_both = np.moveaxis(patches.nodes[0], -2, 0)
+    value, by_x, by_y, by_both = np.moveaxis(nodes[0], -2, 0)
 
     def middle(low_high: Any, slopes: Any, axis: int) -> Any:
         low, high = (np.moveaxis(low_high, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))

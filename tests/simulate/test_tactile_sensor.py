@@ -159,7 +159,7 @@ def test_copies_of_a_hand_share_their_tables() -> None:
     hands = tuple(hand.model_copy(update={"name": name}) for name in ("a", "b"))
     pads = build_pad_model(HAND.model_copy(update={"hands": hands}))
     own = len(hand.pads)
-    for made in (pads.surface_tables, pads.stage_tolerances(), pads.stage_tables()):
+    for made in (pads.surfaces, pads.stage_tolerances(), pads.stage_tables()):
         assert made[0] is made[own]
         assert made[0] is not made[1]
 

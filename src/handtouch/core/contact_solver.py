@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.arrays import FloatArray
-from handtouch.core.memory import RowArray, made_once, view_memory, view_rows
+from handtouch.core.memory import RowArray, view_memory, view_rows
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.solve import (
@@ -30,7 +30,6 @@ from handtouch.core.stages.solve import (
     VALUE_SLICES,
     ContactSolver,
 )
-from handtouch.core.stages.tables import PadSurface
 from handtouch.core.stages.tolerances import PartKnowledge
 from handtouch.core.stages.two_sheets import TwoSheets
 
@@ -82,7 +81,7 @@ def make_solver(
         models=model.stage_tables(),
         pad_tolerances=model.stage_tolerances(),
         laws=model.stage_laws(),
-        surfaces=made_once(PadSurface, zip(model.surface_tables, strict=True)),
+        surfaces=model.surfaces,
         known=PartKnowledge(
             axes=model.part_axes,
             ends=model.part_axis_ends,

@@ -21,12 +21,13 @@ from handtouch.config.roles import CHANNEL_ROLES, SECOND_SHEET, SHEAR, channel_n
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.channel_currents import ChannelCurrents
 from handtouch.core.memory import RowArray, made_once, number_row, rows_at, rows_by_name, view_memory
-from handtouch.core.pad_tables import ForwardTable, SurfacePatches, pair_limit
+from handtouch.core.pad_tables import ForwardTable, pair_limit
 from handtouch.core.shear_pads import shear_parameters
 from handtouch.core.sheet_force import SheetBehaviour, sheet_behaviour_of
 from handtouch.core.stages.force import LAW_ROW, PadLaw
 from handtouch.core.stages.locate import ModelTable
 from handtouch.core.stages.rows import TOUCH_ROW
+from handtouch.core.stages.tables import PadSurface
 from handtouch.core.stages.tolerances import PadTolerances, part_count, shape_error
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.contact_law import ContactLaw
@@ -88,7 +89,7 @@ class PadModel:
     `mounts` (n, MOUNT_COUNT): origins of the pads on their links, and their variances, see `ContactSolver`.
     `peak_currents_a` (n,): largest current of an electrode by a contact of the sheet's `max_force_n`.
 
-    `forward_tables` (those without an electrode where it is dead), `surface_tables` and `law_parameters` are
+    `forward_tables` (those without an electrode where it is dead), `surfaces` and `law_parameters` are
     what the stages read; `weight` (n, c) is 1 / `noise_a`. `networks` are the exact theory that the tables
     approximate.
     """
@@ -112,7 +113,7 @@ class PadModel:
         self.frame_links = [pad.mount.link or pad.link for pad in pads]
         self.rows_of_hand = _rows_of_hands(self.hands)
         self.mounts = np.concatenate([_mounts_of(hand) for hand in deployment.hands])
-        self.surface_tables = made_once(_surface_patches, zip(pads, strict=True))
+        self.surfaces = made_once(_surface_of, zip(pads, strict=True))
         self._set_channels(deployment)
         self.networks = networks = networks_of(deployment)
         self.forward_tables = made_once(forward_table, zip(networks, strict=True))
@@ -582,8 +583,8 @@ def _rows_of_hands(hands: list[str]) -> dict[str, slice]:
     return {hand: slice(start, start + hands.count(hand)) for hand, start in first.items()}
 
 
-def _surface_patches(pad: config.Pad) -> SurfacePatches:
-    return SurfacePatches.from_surface(pad_surface(pad), *mount_transform(pad))
+def _surface_of(pad: config.Pad) -> PadSurface:
+    return PadSurface(pad_surface(pad), *mount_transform(pad))
 
 
 def networks_of(deployment: Deployment) -> list[ChannelModel]:

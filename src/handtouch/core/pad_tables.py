@@ -1,6 +1,6 @@
-"""Tables of forward models and surfaces that the stages read, built once for each distinct pad.
+"""Tables of forward models that the stages read, built once for each distinct pad.
 
-Public names: `ForwardTable`, `SurfacePatches`, `hermite_table`, `pair_limit`, `MAX_SQUARED_MISFIT`.
+Public names: `ForwardTable`, `hermite_table`, `pair_limit`, `MAX_SQUARED_MISFIT`.
 
 A forward model is tabulated over cells that shrink towards the edges and the ends of the electrodes, as the
 distances do over which its fractions vary.
@@ -21,7 +21,6 @@ from handtouch.arrays import FloatArray
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.model import ChannelModel
 from handtouch.field.network import ElectrodeNetwork
-from handtouch.field.surface_base import Surface
 
 _STENCIL = 7  # nodes that a slope is computed from
 _FORWARD_CELLS = 108  # a table of four electrodes has 1.9 MB
@@ -34,10 +33,6 @@ MIN_PAIR_ELECTRODES = 6
 _BISECTIONS = 60
 _MIN_EDGE_DISTANCE = 1e-6  # distance over a side
 _MIN_RADIUS_DISTANCE = 1e-3  # distance over a side: the spreading radius vanishes at an edge
-_SURFACE_CELLS = (8, 16, 32, 64)
-_MAX_SURFACE_ERROR = 1e-7
-"""Error between the nodes over a pad's size."""
-_MAX_LOG_SCALE = 2.0  # of a contact, from its median; it vanishes at an outline's vertices
 MAX_SQUARED_MISFIT = 9.0
 """Squared misfit of a point contact, in variances of noise and tolerances, that these explain; of n currents,
 n - 3 degrees of freedom, scaled so that this is as likely as of one. Beyond it the contact is no point: the
@@ -312,69 +307,3 @@ def _fields_of_network(
 def _inside(x: FloatArray) -> FloatArray:
     """Return node coordinates with the outermost off the edges, where a model may have no value."""
     return np.clip(x, _MIN_EDGE_DISTANCE * x[-1], (1 - _MIN_EDGE_DISTANCE) * x[-1])
-
-
-@dataclass(frozen=True)
-class SurfacePatches:
-    """Surface of a pad in its link's frame, in patches between folds; see `PadSurface`.
-
-    nodes: (patches, cells + 1, cells + 1, 4, 6). ends: (patches,) of y. curvature_per_m2: Gauss's.
-    """
-
-    nodes: FloatArray
-    ends: FloatArray
-    side_x: float
-    curvature_per_m2: float
-
-    @classmethod
-    def from_surface(cls, surface: Surface, rotation: FloatArray, translation: FloatArray) -> SurfacePatches:
-        """Tabulate a surface whose pad frame `rotation` (3, 3) and `translation` (3,) carry to the link's."""
-        ends = np.append(surface.folds, surface.b)
-        begins = np.append(0.0, surface.folds)
-
-        def evaluate(cells: int, inside: FloatArray) -> FloatArray:
-            """Return values (patches, y, x, 6) at nodes or, `inside` of cells, between them."""
-            s = inside / cells
-            patches = []
-            for begin, end in zip(begins, ends, strict=True):
-                # a hair inside: on a fold, the surface is that of the next patch
-                y_inside = begin + (end - begin) * np.clip(s, 1e-12, 1 - 1e-12)
-                x, y = np.meshgrid(surface.a * s, y_inside)
-                position = np.tensordot(rotation, surface.point(x, y), axes=1) + translation[:, None, None]
-                log_scale = np.log(surface.scale(x, y))
-                log_scale = np.clip(log_scale, *(np.median(log_scale) + _MAX_LOG_SCALE * np.array([-1, 1])))
-                columns = [*position, *surface.from_rectangle(x, y), log_scale]
-                patches.append(np.stack(columns, axis=-1))
-            return np.stack(patches)
-
-        size = max(surface.extent_m)
-        for cells in _SURFACE_CELLS:
-            nodes = np.stack([hermite_table(patch) for patch in evaluate(cells, np.arange(cells + 1.0))])
-            between = evaluate(cells, np.arange(0.5, cells))
-            error = np.abs(_mid_cell_values(nodes) - between)[..., :5]
-            if error.max() < _MAX_SURFACE_ERROR * size:
-                break
-        return cls(np.ascontiguousarray(nodes), ends, surface.a, _mean_curvature_per_m2(surface))
-
-
-def _mean_curvature_per_m2(surface: Surface) -> float:
-    """Return Gauss's curvature about a surface's middle: -laplace(ln scale) / scale^2 on the rectangle."""
-    x, y, radius = surface.a / 2, surface.b / 2, min(surface.a, surface.b) / 8
-    angle = np.arange(8) * np.pi / 4
-    around = np.log(surface.scale(x + radius * np.cos(angle), y + radius * np.sin(angle))).mean()
-    middle = float(surface.scale(x, y))
-    return float(4 * (np.log(middle) - around) / (radius * middle) ** 2)
-
-
-def _mid_cell_values(nodes: FloatArray) -> FloatArray:
-    """Return the bicubics (..., y, x, columns) in the middle of the cells."""
-
-    def middle(value: FloatArray, slope: FloatArray, axis: int) -> FloatArray:
-        low, high = [slice(None)] * value.ndim, [slice(None)] * value.ndim
-        low[axis], high[axis] = slice(None, -1), slice(1, None)
-        of_slopes = (slope[tuple(low)] - slope[tuple(high)]) / 8
-        return np.asarray((value[tuple(low)] + value[tuple(high)]) / 2 + of_slopes)
-
-    value, by_x, by_y, by_both = np.moveaxis(nodes, -2, 0)
-    x_axis = value.ndim - 2
-    return middle(middle(value, by_x, x_axis), middle(by_y, by_both, x_axis), x_axis - 1)

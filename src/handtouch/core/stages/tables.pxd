@@ -12,6 +12,7 @@ cdef void read_values(float[::1] table, Py_ssize_t cells, Py_ssize_t columns, do
                       double[::1] out) noexcept
 
 cdef class PadSurface:
+    cdef readonly object nodes
     cdef double[::1] values, ends
     cdef Py_ssize_t cells, patch_floats, patches
     cdef double side_x, curvature

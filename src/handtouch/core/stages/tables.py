@@ -13,11 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from handtouch.core.memory import view_memory
+from handtouch.core.pad_tables import hermite_table
 
 if TYPE_CHECKING:
-    from handtouch.core.pad_tables import SurfacePatches
+    from handtouch.arrays import FloatArray
+    from handtouch.field.surface_base import Surface
 
 _COLUMNS = 6  # of a surface
+_SURFACE_CELLS = (8, 16, 32, 64)
+_MAX_SURFACE_ERROR = 1e-7
+"""Error between the nodes over a pad's size."""
+_MAX_LOG_SCALE = 2.0  # of a contact, from its median; it vanishes at an outline's vertices
 
 
 def read_table(
@@ -111,17 +117,74 @@ def read_values(
 class PadSurface:
     """Surface of one pad in its link's frame, in smooth patches that meet at folds across y.
 
-    values: one table a patch, as `read_table` needs them, of `patch_floats` floats each; columns are position
-    (3) [m], arc lengths from the electrodes x0 and y0 (2) [m] and ln of a contact's scale, on an even grid.
-    ends: (patches,), where each patch ends along y. side_x: of the pad's rectangle. curvature: Gauss's
-    [1/m^2].
+    surface: `rotation` (3, 3) and `translation` (3,) carry its pad frame to the link's.
+    nodes: (patches, cells + 1, cells + 1, 4, 6), one table a patch, as `read_table` needs them, of
+    `patch_floats` floats each; columns are position (3) [m], arc lengths from the electrodes x0 and y0 (2)
+    [m] and ln of a contact's scale, on an even grid. ends: (patches,), where each patch ends along y. side_x:
+    of the pad's rectangle. curvature: Gauss's [1/m^2].
     """
 
-    def __init__(self, surface: SurfacePatches) -> None:
-        self.values, self.ends = view_memory(surface.nodes), view_memory(surface.ends)
-        self.cells, self.patch_floats = surface.nodes.shape[1] - 1, surface.nodes[0].size
-        self.patches, self.side_x = len(surface.ends), surface.side_x
-        self.curvature = surface.curvature_per_m2
+    def __init__(self, surface: Surface, rotation: FloatArray, translation: FloatArray) -> None:
+        self.nodes, ends = _tabulate_patches(surface, rotation, translation)
+        self.values, self.ends = view_memory(self.nodes), view_memory(ends)
+        self.cells, self.patch_floats = self.nodes.shape[1] - 1, self.nodes[0].size
+        self.patches, self.side_x = len(ends), surface.a
+        self.curvature = _mean_curvature_per_m2(surface)
+
+
+def _tabulate_patches(
+    surface: Surface, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the tables of a surface's patches, and where each ends along y; see `PadSurface`."""
+    ends = np.append(surface.folds, surface.b)
+    begins = np.append(0.0, surface.folds)
+
+    def evaluate(cells: int, inside: FloatArray) -> FloatArray:
+        """Return values (patches, y, x, 6) at nodes or, `inside` of cells, between them."""
+        s = inside / cells
+        patches = []
+        for begin, end in zip(begins, ends, strict=True):
+            # a hair inside: on a fold, the surface is that of the next patch
+            y_inside = begin + (end - begin) * np.clip(s, 1e-12, 1 - 1e-12)
+            x, y = np.meshgrid(surface.a * s, y_inside)
+            position = np.tensordot(rotation, surface.point(x, y), axes=1) + translation[:, None, None]
+            log_scale = np.log(surface.scale(x, y))
+            log_scale = np.clip(log_scale, *(np.median(log_scale) + _MAX_LOG_SCALE * np.array([-1, 1])))
+            columns = [*position, *surface.from_rectangle(x, y), log_scale]
+            patches.append(np.stack(columns, axis=-1))
+        return np.stack(patches)
+
+    size = max(surface.extent_m)
+    for cells in _SURFACE_CELLS:
+        nodes = np.stack([hermite_table(patch) for patch in evaluate(cells, np.arange(cells + 1.0))])
+        between = evaluate(cells, np.arange(0.5, cells))
+        error = np.abs(_mid_cell_values(nodes) - between)[..., :5]
+        if error.max() < _MAX_SURFACE_ERROR * size:
+            break
+    return np.ascontiguousarray(nodes), ends
+
+
+def _mean_curvature_per_m2(surface: Surface) -> float:
+    """Return Gauss's curvature about a surface's middle: -laplace(ln scale) / scale^2 on the rectangle."""
+    x, y, radius = surface.a / 2, surface.b / 2, min(surface.a, surface.b) / 8
+    angle = np.arange(8) * np.pi / 4
+    around = np.log(surface.scale(x + radius * np.cos(angle), y + radius * np.sin(angle))).mean()
+    middle = float(surface.scale(x, y))
+    return float(4 * (np.log(middle) - around) / (radius * middle) ** 2)
+
+
+def _mid_cell_values(nodes: FloatArray) -> FloatArray:
+    """Return the bicubics (..., y, x, columns) in the middle of the cells."""
+
+    def middle(value: FloatArray, slope: FloatArray, axis: int) -> FloatArray:
+        low, high = [slice(None)] * value.ndim, [slice(None)] * value.ndim
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        of_slopes = (slope[tuple(low)] - slope[tuple(high)]) / 8
+        return np.asarray((value[tuple(low)] + value[tuple(high)]) / 2 + of_slopes)
+
+    value, by_x, by_y, by_both = np.moveaxis(nodes, -2, 0)
+    x_axis = value.ndim - 2
+    return middle(middle(value, by_x, x_axis), middle(by_y, by_both, x_axis), x_axis - 1)
 
 
 class Placement:
