@@ -28,32 +28,24 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import can
-import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.page import Report, options, progress
-from benchmarks.served_hand import VCAN
+from benchmarks.served_hand import PORT, VCAN, on_loopback
 from handtouch.canbus import cia301
-from handtouch.canbus.bus.bus_state import BusFault, fault_from_exception
+from handtouch.canbus.bus.bus_state import fault_from_exception
 from handtouch.canbus.bus.loop_pause import LoopPause
-from handtouch.canbus.bus.port import Port
 from handtouch.canbus.bus.receivers import grow_receive_buffer
-from handtouch.canbus.bus.router import CanFrame, Router
 from handtouch.canbus.bus.sync import Sync
 from handtouch.canbus.nodes import master as master_module
 from handtouch.canbus.nodes.lifecycle_types import NodeState
-from handtouch.canbus.nodes.master import Master
-from handtouch.canbus.nodes.spec import NodeEvent, NodeSpec
+from handtouch.canbus.nodes.spec import NodeEvent
 from handtouch.canbus.objects import sdo
 from handtouch.client import connect, request
-from handtouch.config import Bus, shipped
-from handtouch.core.slab import Slab
-from handtouch.device import DeviceBus
+from tests.canbus.conftest import MS, SYNC_PERIOD_MS, Jobs, Rig
 
 GATEWAY = "gateway"
 """Act of a program of another stack, which the injected bus can't have."""
@@ -151,219 +143,155 @@ class Verdicts:
         ]
 
 
-MS, SECOND = 1_000_000, 1_000_000_000
+SECOND = 1_000_000_000
 NODES = range(1, 16)
-PERIOD_NS, STEP_NS = 10 * MS, 5 * MS
+PERIOD_NS, STEP_NS = SYNC_PERIOD_MS * MS, 5 * MS
 RECOVERY_S = 10.0
-WORKER_POLL_S = 0.0001
 ACTS = ("nmt", "sync", "sdo", "flood", "emcy", "short", "pause", "down", "nothing")
 COMMANDS = (cia301.STOP_NODE, cia301.ENTER_PREOPERATIONAL, cia301.RESET_COMMUNICATION, cia301.RESET_NODE)
 GUEST_PERIOD_MS, GUEST_HEARTBEAT_TIMEOUT_MS = 50, 1000
 
 
-class InjectedBus:
-    """A bus in this thread: python-can's to `DeviceBus`, a receiver to `Port`."""
-
-    def __init__(self, clock: Callable[[], int]) -> None:
-        self.fault: BusFault | None = None
-        self.backlog_ns: int | None = None
-        self.is_down = False
-        self.devices: DeviceBus | None = None
-        self._clock = clock
-        self._waiting: deque[tuple[can.Message, int]] = deque()
-
-    def recv(self, timeout: float | None = None) -> None:
-        """Return nothing: frames are passed to the devices when they are sent."""
-
-    def fileno(self) -> int:
-        return -1
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def send_cyclically(self, *_: object) -> None:
-        """No cyclic sender."""
-
-    def drain(self, router: Router) -> list[CanFrame]:
-        frames = [router.accept_message(*self._waiting.popleft()) for _ in range(len(self._waiting))]
-        if self.is_down:
-            self.fault = fault_from_exception(OSError(errno.ENETDOWN, "Network is down"))
-        return [frame for frame in frames if frame is not None]
-
-    def send(self, *frame: Any) -> None:
-        """Send a message of a device, or identifier, data and remote flag of the port."""
-        if len(frame) == 1:
-            message = frame[0]
-            if not self.is_down:
-                copy = can.Message(
-                    arbitration_id=message.arbitration_id, data=bytes(message.data), is_extended_id=False
-                )
-                self._waiting.append((copy, self._clock()))
-            return
-        if self.is_down:
-            raise OSError(errno.ENETDOWN, "Network is down")
-        can_id, data, remote = frame
-        self.inject_to_devices(can_id, data, remote)
-
-    def inject_to_devices(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Pass a frame to the devices only."""
-        assert self.devices is not None
-        self.devices.handle_frame(
-            can.Message(arbitration_id=can_id, data=data, is_remote_frame=remote, is_extended_id=False),
-            self._clock(),
-        )
-
-    def inject(self, can_id: int, data: bytes) -> None:
-        """Send a frame of another device to all."""
-        if not self.is_down:
-            self.inject_to_devices(can_id, data)
-            self._waiting.append(
-                (can.Message(arbitration_id=can_id, data=data, is_extended_id=False), self._clock())
-            )
-
-
-class CountedWorkers(ThreadPoolExecutor):
-    """The master's worker threads; the injected clock stands still while they are busy."""
-
-    steps: ClassVar[set[Future[Any]]] = set()
-
-    def submit(self, *call: Any, **options: Any) -> Future[Any]:
-        """Submit a step and remember it until it has ended."""
-        step = super().submit(*call, **options)
-        self.steps.add(step)
-        step.add_done_callback(self.steps.discard)
-        return step
-
-
-class InjectedHand:
-    """15 nodes, master and SYNC on an injected bus and clock, and the daemon's order of work."""
+class InjectedHand(Rig):
+    """The tests' nodes and master on an injected bus and clock, with SYNC and the daemon's order of work."""
 
     def __init__(self) -> None:
-        self.now_ns = 1000 * SECOND
-        self.bus = InjectedBus(lambda: self.now_ns)
-        counts = np.tile(np.array([10, 20, 30, 40], dtype=np.int64), (len(NODES), 1))
-        self.bus.devices = self.devices = DeviceBus(self.bus, _sampler(counts), clock=lambda: self.now_ns)  # type: ignore[arg-type]
-        for number in NODES:
-            self.devices.add(number, serial=100 + number)
-        slab = Slab(len(NODES))
-        port = Port(Bus(name="can", interface="virtual", channel="soak"), self.bus, slab)
-        specs = [NodeSpec(slot=n - 1, bus="can", node_id=n, name=f"pad{n}") for n in NODES]
-        self.port, self.slab = port, slab
-        self.sync = Sync([port], PERIOD_NS)
-        self.master = Master({"can": port}, specs, PERIOD_NS)
+        super().__init__(len(NODES))
+        self._sync = Sync([self.port], PERIOD_NS)
         self._pause = LoopPause(PERIOD_NS)
-        for device in self.devices.devices.values():
-            device.plug()
-        self.sync.start(self.now_ns)
-        self.master.start(self.now_ns)
+        self.plug_all()
+        self._sync.start(self.t_ns)
+        self.start()
 
     @property
     def is_operational(self) -> bool:
         """True if all nodes are."""
         return bool((self.master.states == NodeState.OPERATIONAL).all())
 
-    def run(self, seconds: float, during: Callable[[], None] = lambda: None) -> Iterator[NodeEvent]:
-        """Run for a time, with something in every step; yield the nodes' events."""
+    def advance(self, seconds: float, during: Callable[[], None] = lambda: None) -> Iterator[NodeEvent]:
+        """Advance the clock, with something in every step; yield the nodes' events."""
         for _ in range(round(seconds * SECOND / STEP_NS)):
             during()
-            self._pause.begin_wait(self.now_ns)
-            self._pass_time(STEP_NS)
-            yield from self._work(self.now_ns)
+            self._pause.begin_wait(self.t_ns)
+            self._pass_time()
+            yield from self._work(self.t_ns)
 
-    def pause(self, seconds: float) -> Iterator[NodeEvent]:
+    def stop_for(self, seconds: float) -> Iterator[NodeEvent]:
         """Stop the loop while the nodes go on."""
-        self._pause.begin_wait(self.now_ns)
-        wake_ns = self.now_ns + STEP_NS
+        self._pause.begin_wait(self.t_ns)
+        wake_ns = self.t_ns + STEP_NS
         for _ in range(round(seconds * SECOND / STEP_NS)):
-            self._pass_time(STEP_NS)
+            self._pass_time()
         yield from self._work(wake_ns)
 
-    def _pass_time(self, step_ns: int) -> None:
-        self.now_ns += step_ns
-        self.devices.advance(self.now_ns)
+    def take_down(self, seconds: float) -> Iterator[NodeEvent]:
+        """Take the interface down for a time."""
+
+        def fail() -> None:
+            self.wire.fault = fault_from_exception(OSError(errno.ENETDOWN, "Network is down"))
+
+        self.wire.down, self.wire.cut = True, {*NODES}
+        yield from self.advance(seconds, fail)
+        self.wire.down, self.wire.cut = False, set()
+
+    def send_to_nodes(self, can_id: int, data: bytes) -> None:
+        """Pass a frame to the nodes only."""
+        self.devices.handle_frame(
+            can.Message(arbitration_id=can_id, data=data, is_extended_id=False), self.t_ns
+        )
+
+    def send_to_all(self, can_id: int, data: bytes) -> None:
+        """Send a frame of another device."""
+        self.send_to_nodes(can_id, data)
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        self.wire.to_master.append((message, self.t_ns))
+
+    def _pass_time(self) -> None:
+        self.t_ns += STEP_NS
+        self.devices.advance(self.t_ns)
 
     def _work(self, wake_ns: int) -> Iterator[NodeEvent]:
-        if paused_ns := self._pause.end_wait(wake_ns, self.now_ns):
-            self.sync.excuse_pause(paused_ns)
-            self.master.excuse_pause(paused_ns, self.now_ns)
-        self._receive()
-        self._pause.end_receive(self.now_ns)
-        for sync_ns in self.sync.poll(self.now_ns, self.now_ns):
+        if paused_ns := self._pause.end_wait(wake_ns, self.t_ns):
+            self._sync.excuse_pause(paused_ns)
+            self.master.excuse_pause(paused_ns, self.t_ns)
+        self.pump()
+        self._pause.end_receive(self.t_ns)
+        for sync_ns in self._sync.poll(self.t_ns, self.t_ns):
             self.slab.begin_cycle(sync_ns)
-        self.port.update_state(self.now_ns)
-        self.master.poll(self.now_ns)
-        while CountedWorkers.steps:
-            time.sleep(WORKER_POLL_S)
-            self._receive()
-        self.master.poll(self.now_ns)
-        yield from (e for e in self.master.drain_events() if isinstance(e, NodeEvent))
+        self.port.update_state(self.t_ns)
+        self.master.poll(self.t_ns)
+        assert isinstance(self.master._workers, Jobs)
+        self.master._workers.work()
+        self.pump()
+        self.master.poll(self.t_ns)
+        self.wire.sent.clear()
+        yield from (event for event in self.master.drain_events() if isinstance(event, NodeEvent))
 
-    def _receive(self) -> None:
+    def pump(self) -> None:
+        """Receive what waits."""
         for can_id, data, arrival_ns in self.port.drain():
             if can_id == cia301.SYNC:
-                self.sync.handle_sync("can", arrival_ns)
+                self._sync.handle_sync("can", arrival_ns)
             else:
                 self.master.handle_frame("can", can_id, data, arrival_ns)
 
 
-def _sampler(counts: NDArray[np.int64]) -> Callable[[int], NDArray[np.int64]]:
-    return lambda _: counts
-
-
 def injected(hours: float) -> Verdicts:
     """Run the acts for so many hours of the injected clock."""
-    master_module.ThreadPoolExecutor = CountedWorkers  # type: ignore[attr-defined]
-    sdo.SDO_TIMEOUT_S = 0.05  # of real time, while the injected clock stands still
+    master_module.ThreadPoolExecutor = Jobs  # type: ignore[attr-defined, assignment]
+    sdo.SDO_TIMEOUT_S = 0.005  # of real time, while the injected clock stands still
     hand, verdicts, generator = InjectedHand(), Verdicts(), random.Random(1)
-    list(hand.run(2.0))
+    list(hand.advance(2.0))
     assert hand.is_operational, hand.master.status()
-    end_ns = hand.now_ns + round(hours * 3600 * SECOND)
+    end_ns = hand.t_ns + round(hours * 3600 * SECOND)
     for act in itertools.cycle(ACTS):
-        if hand.now_ns >= end_ns:
+        if hand.t_ns >= end_ns:
             break
         verdicts.acts[act] += 1
         if act == ACTS[0]:
             progress(
-                f"{(hand.now_ns - end_ns) / 3600e9 + hours:.2f} of {hours:g} h, {len(verdicts.broken)} broken"
+                f"{(hand.t_ns - end_ns) / 3600e9 + hours:.2f} of {hours:g} h, {len(verdicts.broken)} broken"
             )
-        events = itertools.chain(_act_injected(hand, act, generator), hand.run(RECOVERY_S))
+        events = itertools.chain(_act_injected(hand, act, generator), hand.advance(RECOVERY_S))
         for event in events:
             old, new = event.old_state.name.lower(), event.new_state.name.lower()
             if old != new:
                 verdicts.judge(act, f"node {event.slot + 1}", old, new, event.reason)
         if not hand.is_operational:
             verdicts.broken.append(f"{act}: not operational after {RECOVERY_S} s")
-    hand.master.stop(hand.now_ns)
+    hand.master.stop(hand.t_ns)
     return verdicts
 
 
 def _act_injected(hand: InjectedHand, act: str, generator: random.Random) -> Iterator[NodeEvent]:
-    bus, choose = hand.bus, generator.choice
+    choose = generator.choice
     if act == "nmt":
-        bus.inject(cia301.NMT, bytes((choose(COMMANDS), choose((0, *NODES)))))
+        hand.send_to_all(cia301.NMT, bytes((choose(COMMANDS), choose((0, *NODES)))))
         return iter(())
     if act == "pause":
-        return hand.pause(choose((0.3, 0.6, 2.0)))
+        return hand.stop_for(choose((0.3, 0.6, 2.0)))
     if act == "down":
-        return _down(hand, generator.uniform(0.1, 5.0))
+        return hand.take_down(generator.uniform(0.1, 5.0))
 
     def send() -> None:
         match act:
             case "sync":
-                bus.inject(cia301.SYNC, b"")
+                hand.send_to_all(cia301.SYNC, b"")
             case "sdo":
-                bus.inject_to_devices(cia301.SDO_REQUEST + choose(NODES), b"\x40\x18\x10\x01" + bytes(4))
+                hand.send_to_nodes(cia301.SDO_REQUEST + choose(NODES), b"\x40\x18\x10\x01" + bytes(4))
             case "flood":
                 for _ in range(40):
-                    bus.inject(generator.choice(FOREIGN_IDS), generator.randbytes(generator.randrange(9)))
+                    hand.send_to_all(
+                        generator.choice(FOREIGN_IDS), generator.randbytes(generator.randrange(9))
+                    )
             case "emcy":
-                bus.inject(cia301.EMCY + choose(NODES), b"\x00\x10\x00" + bytes(5))
+                hand.send_to_all(cia301.EMCY + choose(NODES), b"\x00\x10\x00" + bytes(5))
             case "short":
-                bus.inject(
+                hand.send_to_all(
                     choose((0x80, 0x280, 0x580, 0x700)) + choose(NODES), generator.randbytes(SHORT_BYTES)
                 )
 
-    return hand.run(5.0, send)
+    return hand.advance(5.0, send)
 
 
 FOREIGN_IDS = [
@@ -374,12 +302,6 @@ FOREIGN_IDS = [
 """Identifiers that no node of the hand and no command has."""
 
 
-def _down(hand: InjectedHand, seconds: float) -> Iterator[NodeEvent]:
-    hand.bus.is_down = True
-    yield from hand.run(seconds)
-    hand.bus.is_down = False
-
-
 def socketcan(minutes: float, gateway: Path | None) -> Verdicts:
     """Run the acts on vcan0 for so many minutes, against the daemon's own process."""
     verdicts, generator = Verdicts(), random.Random(1)
@@ -387,9 +309,9 @@ def socketcan(minutes: float, gateway: Path | None) -> Verdicts:
         folder = Path(name)
         config = _guest_deployment(folder)
         with (folder / "run.txt").open("w") as output:
-            words = [str(config), "--bus", "can0=socketcan:vcan0"]
-            nodes = subprocess.Popen([sys.executable, "-m", "handtouch", "simulate", *words], stdout=output)
-            daemon = subprocess.Popen([sys.executable, "-m", "handtouch", "run", *words], stderr=output)
+            command = [sys.executable, "-m", "handtouch"]
+            nodes = subprocess.Popen([*command, "simulate", str(config)], stdout=output)
+            daemon = subprocess.Popen([*command, "run", str(config)], stderr=output)
             try:
                 return _run_guest(folder, daemon, verdicts, generator, minutes, gateway)
             finally:
@@ -401,15 +323,12 @@ def socketcan(minutes: float, gateway: Path | None) -> Verdicts:
 
 
 def _guest_deployment(folder: Path) -> Path:
-    endpoints = "\n".join(
-        f'{stream} = "ipc://{folder}/{stream}"' for stream in ("live", "complete", "control", "inputs")
-    )
-    text = shipped.path("utah_mit.toml").read_text()
-    text = text.replace("[daemon]\n", f"[daemon]\n{endpoints}\nsupervise = false\n")
+    config = on_loopback(folder, PORT)
+    text = config.read_text().replace("[daemon]\n", "[daemon]\nsupervise = false\n")
     text = re.sub(r"sync_period_ms = [\d.]+", f"sync_period_ms = {GUEST_PERIOD_MS}", text)
     timeout = f"heartbeat_timeout_ms = {GUEST_HEARTBEAT_TIMEOUT_MS}"
-    (folder / "hand.toml").write_text(re.sub(r"heartbeat_timeout_ms = \d+", timeout, text))
-    return folder / "hand.toml"
+    config.write_text(re.sub(r"heartbeat_timeout_ms = \d+", timeout, text))
+    return config
 
 
 def _run_guest(
