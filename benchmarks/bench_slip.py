@@ -1,4 +1,4 @@
-"""Slip: recall, delay and false alarms by world, and detection by force alone.
+"""Slip: recall, delay and false alarms by world.
 
 The shipped hand, 15 pads at once, drawn in each [world](../worlds.md) for a seed of the reporting family,
 through the daemon's own pipeline and percepts. A grip has tremor: 10 % ripple of force and 15 um of sway,
@@ -23,17 +23,13 @@ their own, `ARGS="--part noise"`.
 noise as stated.
 
 *Bound*: when ln of the likelihood ratio of a slip of known onset, speed and direction would reach the
-threshold in the mean (Lorden), with the test's own estimates of tremor and noise. *Threshold on the
-derivative*: all speeds at 0.5 and 2 N together, 200 Hz, world `ideal`, |dF/dt| / F; thresholds with at most
-one false alarm a minute and contact. *Cost* of a tick with 15 contacts: samples to contacts; then, after
-contacts are sent, the slip stage and the messages of motion percepts; medians of processor time.
+threshold in the mean (Lorden), with the test's own estimates of tremor and noise.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,18 +73,10 @@ class PerceptCollector:
 
 @dataclass
 class Record:
-    """Results by tick: times [s] (k,) since the begin; ln R, force [N], running tests (k, pads)."""
+    """Results by tick: times [s] (k,) since the begin; running tests (k, pads)."""
 
     t_s: FloatArray
-    log_odds: FloatArray
-    force_n: FloatArray
     running: npt.NDArray[np.bool_]
-    tick_s: FloatArray
-    """(k,), duration of the tick."""
-    slip_s: FloatArray
-    """(k,), duration of the slip stage, after the messages of the contacts."""
-    report_s: FloatArray
-    """(k,), duration of the motion percepts."""
     percepts: list[wire.Percept]
     information: tuple[FloatArray, FloatArray]
     """At `information_s`: ages [s] of ramps (pads, onsets), and information of 1 m/s along either axis.
@@ -99,8 +87,6 @@ class Record:
     """Mean samples between false alarms, the threshold on R of an alarm."""
     named_noisy: Share
     """Pads with the diagnosis `noise`, at `named_s`."""
-    load: float = 1.0
-    """Force during the slip, relative to that before."""
 
 
 def pads_of(deployment: Deployment) -> list[tuple[str, tuple[float, float]]]:
@@ -147,11 +133,7 @@ def run(
     pipeline = pipeline_of(deployment, collector, model=model, period_ns=period_ns)
     perceiving = PerceptPublisher(deployment, pipeline, collector, process=InlineProcess(deployment))
     request_percepts(pipeline, perceiving, ["motion"])
-    slip, queued_s = pipeline.tick.slip, [0.0]
-    pipeline.on_messages_queued = lambda: queued_s.append(time.thread_time())
-    shape = len(times), model.size
-    log_odds, force, running = np.empty(shape), np.empty(shape), np.empty(shape, dtype=np.bool_)
-    durations_s = np.empty((3, len(times)))
+    slip, running = pipeline.tick.slip, np.empty((len(times), model.size), dtype=np.bool_)
     named, report = Share(0, model.size), NoiseReport(model.size)
     payload, information = counts.astype("<i2"), (np.zeros((model.size, 0)), np.zeros((model.size, 0)))
     for k, t_s in enumerate(times.tolist()):
@@ -159,29 +141,19 @@ def run(
         pipeline.begin_cycle(t_ns, t_ns)
         for pad in range(model.size):
             pipeline.slab.write_pdo(pad, payload[k, pad].tobytes(), t_ns + 1000 + pad)
-        began_s = time.thread_time()
         ticked = pipeline.tick_if_due(t_ns + round(0.7 * period_ns))
         assert ticked is not None
-        ticked_s = time.thread_time()
         perceiving.process_tick(ticked, t_ns)
-        perceived_s = time.thread_time()
         pipeline.prepare_next_tick()
-        durations_s[:, k] = queued_s[-1] - began_s, ticked_s - queued_s[-1], perceived_s - ticked_s
         contacts = slip.contacts()
-        log_odds[k], running[k] = contacts.log_ratio, contacts.slipping != 0
+        running[k] = contacts.slipping != 0
         if k == round(information_s * hz):
             information = contacts.onset_ages_s.copy(), contacts.ramps[:, :, INFORMATION].mean(axis=1)
         if k == round(named_s * hz):
             named = Share(sum(report.find(pipeline.tick)), model.size)
-        force[k] = pipeline.tick.columns.force_n
     return Record(
         times - from_s,
-        log_odds,
-        force,
         running,
-        durations_s[0],
-        durations_s[1],
-        durations_s[2],
         collector.percepts,
         information,
         slip.samples_per_false_alarm,
@@ -199,7 +171,6 @@ Slips = list[tuple[float, float, Record, int]]
 """Speed [mm/s], force [N], record and pad of each."""
 LOADS = {0: 1.0, 1: 0.7}
 GRIPPED_S, SLIPS_S, RUN_S, LATEST_S = 0.3, 1.8, 2.3, 0.5
-SMOOTH_S = (0.0, 0.01, 0.03)
 BURST_MM = 0.1
 NOISES = (1.0, 0.0), (1.5, 0.0), (2.0, 0.0), (3.0, 0.0), (1.0, 10.0)
 """True noise over stated, and amplitude of hum in counts."""
@@ -211,7 +182,6 @@ HOLD_HANDS, HOLD_S, HOLD_SLIPS, FAST_MM_PER_S = (31, 32), 125.0, 4, 10.0
 """Hands of the reporting family in `default` for an hour of grips with chatter: length of the grips of each
 hand, and rounds of slips; speed from which the share found is stated."""
 ALARMS = ("incipient", "sliding")
-DEAD_S = 0.2  # alarms closer than that are one
 Rows = list[dict[str, Any]]
 
 
@@ -235,7 +205,6 @@ def slip_all(world: DrawnWorld, hz: float, repeats: int, seed: int = 0) -> Slips
             for number, (speed, force) in enumerate(combos)
         ]
         record = run(grips, world, hz, RUN_S, from_s, SLIPS_S - 0.02)
-        record.load = LOADS[repeat % 2]
         found += [(speed, force, record, pad) for pad, (speed, force) in enumerate(combos)]
     return found
 
@@ -260,64 +229,12 @@ def grip(number: int, from_s: float, seconds: float, force_n: float, seed: int, 
     )
 
 
-def derivative(record: Record, smooth_s: float) -> FloatArray:
-    """(k, pads) relative rate of force, |dF/dt| / F, smoothed: what a plain detector watches."""
-    force = np.where(np.isfinite(record.force_n), record.force_n, 0.0)
-    dt_s = record.t_s[1] - record.t_s[0]
-    part = 1 - math.exp(-dt_s / smooth_s) if smooth_s else 1.0
-    smooth, rates = force[0].copy(), np.zeros_like(force)
-    for k in range(1, len(force)):
-        before = smooth.copy()
-        smooth += part * (force[k] - smooth)
-        rates[k] = np.abs(smooth - before) / dt_s / np.maximum(smooth, 0.05)
-    return rates
-
-
-def false_per_minute(value: FloatArray, threshold: float, t_s: FloatArray) -> float:
-    """Alarms per minute and contact, from a second after the grip closed."""
-    held = t_s > GRIPPED_S + 1.0
-    minutes = value.shape[1] * float(t_s[-1] - GRIPPED_S - 1.0) / 60
-    above = value[held] > threshold
-    count = 0
-    for pad in range(above.shape[1]):
-        last = -1e9
-        for at in t_s[held][above[:, pad]].tolist():
-            count += at - last > DEAD_S
-            last = at
-    return float(count / minutes)
-
-
-def latency_s(value: FloatArray, threshold: float, t_s: FloatArray) -> float:
-    """From the onset to the first value above the threshold; inf when none comes in time."""
-    after = (t_s > SLIPS_S) & (t_s <= SLIPS_S + LATEST_S)
-    above = np.flatnonzero(value[after] > threshold)
-    return float(t_s[after][above[0]]) - SLIPS_S if len(above) else math.inf
-
-
 def bound_s(record: Record, pad: int, mm_per_s: float) -> float:
     """Mean detection time of a ramp of known onset, speed and direction, in tremor as modelled: as
     ln of its likelihood ratio reaches the threshold's (G. Lorden 1971); inf: not in half a second."""
     ages, information = (of[pad] for of in record.information)
     enough = 0.5 * (1e-3 * mm_per_s) ** 2 * information >= math.log(record.samples_per_false_alarm)
     return float(ages[enough].min()) if enough.any() else math.inf
-
-
-def curve(made: list[tuple[FloatArray, FloatArray]], held: FloatArray, t_s: FloatArray) -> Rows:
-    """Thresholds that give many or few false alarms: what share of slips is found then, and how soon."""
-    lasting = held[t_s > GRIPPED_S + 1.0]
-    parts = [0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 0.9995, 0.9998, 0.9999, 0.99995, 1.0]
-    thresholds = np.unique(np.quantile(lasting, parts))
-    rows = []
-    for threshold in thresholds.tolist():
-        late = np.array([latency_s(value, threshold, times) for value, times in made])
-        rows.append(
-            {
-                "false a minute": false_per_minute(held, threshold, t_s),
-                "found": Share.of_mask(np.isfinite(late)),
-                "median ms": 1e3 * float(np.median(late)),
-            }
-        )
-    return rows
 
 
 def percept_alarms(firm: Record, from_s: float = GRIPPED_S + 1.0, alarms: tuple[str, ...] = ALARMS) -> int:
@@ -455,36 +372,11 @@ def latencies(name: str, hz: float, made: Slips) -> Rows:
     return rows
 
 
-def curves(made: list[tuple[float, float, Record, int]], firm: Record) -> dict[str, Rows]:
-    """Ours, and the rate of force, smoothed over several times; of forces that saturate no sheet."""
-    made = [slip for slip in made if slip[1] < FORCES[-1]]
-    light = [pad for pad in range(len(PADS)) if FORCES[pad % 3] < FORCES[-1]]
-    ours = [(record.log_odds[:, pad], record.t_s) for _, _, record, pad in made]
-    found = {"sequential test": curve(ours, firm.log_odds[:, light], firm.t_s)}
-    for smooth_s in SMOOTH_S:
-        rates = {id(record): derivative(record, smooth_s) for _, _, record, _ in made}
-        plain = [(rates[id(record)][:, pad], record.t_s) for _, _, record, pad in made]
-        name = f"rate of force over {1e3 * smooth_s:.0f} ms" if smooth_s else "rate of force"
-        found[name] = curve(plain, derivative(firm, smooth_s)[:, light], firm.t_s)
-    return found
-
-
-def cost(hz: float, firm: Record) -> dict[str, Any]:
-    """Medians of a tick with all pads touched, and what slip detection and motion percepts add."""
-    held = firm.t_s > GRIPPED_S + 1.0
-    tick, slip, reports = (
-        1e6 * float(np.median(of[held])) for of in (firm.tick_s, firm.slip_s, firm.report_s)
-    )
-    worst = 1e6 * float(np.quantile(firm.slip_s[held], 0.99))
-    row = {"Hz": hz, "contacts": len(PADS), "tick us": tick, "slip us": slip}
-    return row | {"99 % us": worst, "messages us": reports}
-
-
 def measure(report: Report) -> None:
     quick = report.quick
     seconds, burst_s = (10.0, 10.0) if quick else (20.0, 80.0)
     held_row = chatter(quick)
-    worlds, late, against, costs = [], [], [], []
+    worlds, late = [], []
     for name, hz in CASES[: 3 if quick else None]:
         repeats = 2 if quick or hz > 200 else 4
         made, firm = slip_all(DRAWN[name], hz, repeats), hold(DRAWN[name], hz, min(seconds, 5e3 / hz))
@@ -503,19 +395,10 @@ def measure(report: Report) -> None:
             }
         )
         late += latencies(name, hz, made)
-        if (name, hz) == ("ideal", 200.0):
-            for load, which in ((1.0, "force stays"), (0.7, "force falls to 70 %")):
-                own = curves([slip for slip in made if slip[2].load == load], firm)
-                for detector, rows in own.items():
-                    least = next(row for row in rows if row["false a minute"] <= 1.0)
-                    against.append({"slips": which, "detector": detector, **least})
-        costs.append(cost(hz, firm))
         progress(worlds[-1])
     report.table("By world", worlds)
     report.table("An hour of chatter", [held_row])
     report.table("From onset to alarm", late)
-    report.table("Against a threshold on the derivative of force", against)
-    report.table("Cost", costs)
 
 
 def measure_noise(report: Report) -> None:

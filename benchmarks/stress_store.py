@@ -1,10 +1,10 @@
-"""The calibration store: kills at random instants, journal modes of SQLite, writes and openings.
+"""The calibration store: kills at random instants, writes and openings.
 
 A process opens the store, estimates gains by contacts and writes versions of three nodes without a pause, and
 is killed at a random instant of any of that. It reports what it begins and every commit on a pipe; the store
 must hold what it had committed. A kill doesn't lose what the kernel has; for power loss see
-[calibrations](../calibrations.md). *Journal modes*: 500 transactions each, a row of 2 kB. *The store*: a
-whole calibration a write; opening checks the digest of all rows.
+[calibrations](../calibrations.md). *The store*: a whole calibration a write;
+opening checks the digest of all rows.
 """
 
 from __future__ import annotations
@@ -176,27 +176,6 @@ def kills(folder: Path, count: int) -> dict[str, Any]:
     }
 
 
-def modes(folder: Path) -> list[dict[str, Any]]:
-    """A row of 2 kB a transaction, as bare SQLite writes it."""
-    rows = []
-    for mode in ("WAL NORMAL", "WAL FULL", "DELETE FULL", "DELETE EXTRA"):
-        journal, synchronous = mode.split()
-        connection = sqlite3.connect(folder / f"{journal}-{synchronous}.db", isolation_level=None)
-        connection.execute(f"PRAGMA journal_mode = {journal}")
-        connection.execute(f"PRAGMA synchronous = {synchronous}")
-        connection.execute("CREATE TABLE t (id INTEGER PRIMARY KEY, data BLOB)")
-        took = []
-        for _ in range(500):
-            begin = time.perf_counter()
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute("INSERT INTO t (data) VALUES (randomblob(2000))")
-            connection.execute("COMMIT")
-            took.append(1e3 * (time.perf_counter() - begin))
-        connection.close()
-        rows.append({"journal": journal, "synchronous": synchronous, **_quantiles(took)})
-    return rows
-
-
 def writes_and_openings(folder: Path, largest: int) -> list[dict[str, Any]]:
     """`Store.write` of a whole calibration, and opening (which checks everything), by versions."""
     path, rows, took = folder / "long.db", [], []
@@ -242,7 +221,6 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=ROOT, prefix=".stress-") as name:  # on a disk: /tmp may be memory
         killed = kills(Path(name), 5 if quick else KILLS)
         report.table("Kill -9 while calibrating and storing", [killed])
-        report.table("Journal modes of SQLite", modes(Path(name)))
         report.table("The store", writes_and_openings(Path(name), 100 if quick else 3000))
     for failure in ("lost commits", "wrong contents", "not opened"):
         report.limit(failure, killed[failure], 0)
