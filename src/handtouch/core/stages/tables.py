@@ -131,6 +131,10 @@ class PadSurface:
         self.patches, self.side_x = len(ends), surface.a
         self.curvature = _mean_curvature_per_m2(surface)
 
+    def __deepcopy__(self, _: object) -> PadSurface:
+        """Return itself, which never changes: copies of a model share it."""
+        return self
+
 
 def _tabulate_patches(
     surface: Surface, rotation: FloatArray, translation: FloatArray
