@@ -18,8 +18,7 @@ each pad of each hand once.
 *Force*: *consistent* is within the 95 % interval of the reported standard deviation, or not below a lower
 bound. The estimate assumes one patch of 2.5 mm radius, with a standard deviation of 0.5 mm; those of MuJoCo
 follow Hertz's law for a skin of 1 MPa. *At an edge*: nearer than that radius. Then the same grasps with
-`hertz_force_n = 1.0` stated for the sheets, so that the radius is 2.5 mm there and grows as force^(1/3); and
-with each pad pressed by one disc of the assumed radius.
+`hertz_force_n = 1.0` stated for the sheets, so that the radius is 2.5 mm there and grows as force^(1/3).
 
 *Begin and end*: objects chatter in MuJoCo as they slip. First, contacts against those of an ideal pad, with
 exact samples of MuJoCo's forces and the same thresholds and debouncing; then against MuJoCo's own 1 kHz,
@@ -64,8 +63,6 @@ ONE_PATCH_M = 5.5e-3
 STATED = {"mount_std_mm": 0.2, "mount_std_deg": 0.5}
 HERTZ_FORCE_N = 1.0
 """At which objects of some centimetres have the sheets' 2.5 mm in a skin of 1 MPa."""
-ONE_DISC = ("all", "one patch, radius", "one patch at", "lower bounds, one")
-"""Cases that one disc on a pad has."""
 _WITHIN_95 = {2: 5.991, 3: 7.815}  # chi squared
 
 
@@ -247,7 +244,6 @@ def main() -> None:
         for name, sheet in stated.sheets.items()
     }
     growing = stated.model_copy(update={"sheets": sheets})
-    assumed: list[Served] = []
     hertz: list[Served] = []
     ideal, harsh, unstated = [], [], []
     for seed in range(1, args.seeds + 1):
@@ -255,7 +251,6 @@ def main() -> None:
             setting = drawn_world("default", seed)
             run = served(stated, name, seed, setting)
             runs[name].append(run)
-            assumed.append(served(stated, name, seed, setting, assumed_radius=True, done=run.grasp))
             hertz.append(served(growing, name, seed, setting, done=run.grasp))
             if seed == 1:
                 ideal.append(served(deployment, name, seed, drawn_world("ideal", seed)))
@@ -278,8 +273,6 @@ def main() -> None:
     report.table("Force, N", [forces(name, every, mask) for name, mask in masks.items()])
     rows = [forces(name, hertz, mask) for name, mask in masks.items()]
     report.table("Force, N, with hertz_force_n stated", rows)
-    rows = [forces(name, assumed, mask) for name, mask in masks.items() if name.startswith(ONE_DISC)]
-    report.table("Force, N, of one disc of the assumed radius", rows)
     best = partial(at_best, touch=touch)
     rows = [event_row({"case": name}, of, best) for name, of in cases.items()]
     report.table("Begin and end, against an ideal pad", rows)

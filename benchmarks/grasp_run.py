@@ -108,7 +108,6 @@ def served(
     seed: int,
     world: DrawnWorld,
     *,
-    assumed_radius: bool = False,
     perceive: Literal[True] | Sequence[str] = (),
     duration_s: float = DURATION_S,
     done: GraspRecord | None = None,
@@ -116,7 +115,6 @@ def served(
 ) -> Served:
     """Let the first hand grasp and process the samples; its file describes sheets as their builder would.
 
-    `assumed_radius` replaces the discs of each pad by one of the radius that the force estimate assumes;
     `perceive` requests percepts, all or some kinds; `done` is the grasp if it has been simulated already;
     `used_before`: the sheets are known to be rested, and all zeros known, by a stored state.
     """
@@ -127,9 +125,6 @@ def served(
     grasp = done or simulate_grasp(hand, name, seed, world, duration_s=duration_s)
     patches = contact_patches(grasp)
     stimulus = GraspStimulus.from_grasp(grasp, patches, EncoderErrors.of_world(world, grasp))
-    if assumed_radius:
-        radii = [deployment.sheets[pad.sheet].contact_radius_mm * 1e-3 for pad in hand.pads]
-        stimulus = stimulus.with_single_discs(np.array(radii))
     virtual = VirtualHand(deployment, stimulus, world)
     steps = np.arange(0, len(grasp.times_s), _PER_TICK)
     times_s = np.asarray(steps * TIME_STEP_S, np.float64)

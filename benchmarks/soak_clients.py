@@ -122,13 +122,15 @@ HOSTILE: dict[str, tuple[int, Callable[[Endpoints, Event, int], None]]] = {
 """Kind -> number of clients, and what each does until it is stopped"""
 
 
-def hostile_client(kind: str, endpoints: Endpoints, stop: Event, seed: int) -> None:
+def run_hostile(kind: str, endpoints: Endpoints, seed: int, stop: Event) -> None:
     """Run a client of a kind."""
+    os.nice(ORDINARY_NICE)
     HOSTILE[kind][1](endpoints, stop, seed)
 
 
-def burner(share: float, stop: Event) -> None:
+def run_burner(share: float, stop: Event) -> None:
     """Use a share of one processor."""
+    os.nice(ORDINARY_NICE)
     while not stop.is_set():
         begin_s = time.process_time()
         period_end_s = time.monotonic() + BURN_PERIOD_S
@@ -151,11 +153,13 @@ MAX_GROWTH_MB = 5.0
 """Growth after a third of the time; until then the queues of stalled subscribers fill"""
 
 
-def read(endpoint: str, count: int, stop: Event, measure: Event, results: Any) -> None:
+def run_readers(endpoint: str, measure: Event, results: Any, stop: Event) -> None:
     """Run well-behaved subscribers in a process; put their latencies [s] and losses into a queue."""
     late_s: list[float] = []
     with ExitStack() as stack:
-        readers = [stack.enter_context(connect("hand/*", endpoint=endpoint)) for _ in range(count)]
+        readers = [
+            stack.enter_context(connect("hand/*", endpoint=endpoint)) for _ in range(READERS_PER_PROCESS)
+        ]
         lost_before: list[int] = []
         while not stop.is_set():
             if measure.is_set() and not lost_before:
@@ -188,20 +192,6 @@ def running(targets: list[tuple[Callable[..., None], tuple[Any, ...]]]) -> Itera
             process.kill()
 
 
-def run_hostile(kind: str, endpoints: dict[str, str], seed: int, stop: Event) -> None:
-    os.nice(ORDINARY_NICE)
-    hostile_client(kind, endpoints, stop, seed)
-
-
-def run_burner(share: float, stop: Event) -> None:
-    os.nice(ORDINARY_NICE)
-    burner(share, stop)
-
-
-def run_reader(endpoint: str, measure: Event, results: Any, stop: Event) -> None:
-    read(endpoint, READERS_PER_PROCESS, stop, measure, results)
-
-
 def phase(
     endpoints: dict[str, str],
     own: list[int],
@@ -215,7 +205,7 @@ def phase(
     count = WELL_BEHAVED // READERS_PER_PROCESS
     late_s: list[float] = []
     lost = 0
-    readers = [(run_reader, (endpoints["live"], measure, results))] * count
+    readers = [(run_readers, (endpoints["live"], measure, results))] * count
     with running(readers) as (reader_pids, stop_readers), running(others) as (pids, _):
         time.sleep(JOINING_S)
         measure.set()

@@ -6,7 +6,6 @@ earlier state holds.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -124,14 +123,6 @@ class GraspStimulus:
         links = tuple(pad.link for pad in grasp.pads)
         tangential = np.stack([pad_forces(grasp, row).tangential_n for row in range(len(links))])
         return cls(patches, links, grasp.joints, reported_rad, tangential, repeat)
-
-    def with_single_discs(self, radius_m: FloatArray) -> GraspStimulus:
-        """Return the same forces with one disc per pad, of radius (p,)."""
-        old = self.patches
-        position = np.where(np.isnan(old.force_centre), 0.5, old.force_centre)[:, :, None]
-        radii = np.broadcast_to(radius_m[:, None], (*old.total_n.shape, 1))
-        single = dataclasses.replace(old, position=position, force_n=old.total_n[:, :, None], radius_m=radii)
-        return dataclasses.replace(self, patches=single)
 
     @property
     def max_contacts(self) -> int:
