@@ -49,9 +49,10 @@ from benchmarks.scores import laplace_covariance
 from benchmarks.touched_pads import PipelineCase, Touches, in_turns_of
 from handtouch import config, wire
 from handtouch.config.tables import SceneRequest
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.pad_model import PadModel, contact_law, law_of
 from handtouch.core.stages import solve
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import ElectrodeNetwork, Rectangle
 from handtouch.field.figures import log_ratio
@@ -237,7 +238,7 @@ def core(setup: Setup, *, tracked: bool) -> Estimator:
         while len(parts) <= number:
             given, values = np.zeros((size, 4)), np.full((size, VALUE_COUNT), np.nan)
             wanted = np.ones(size, np.bool_)
-            parts.append((make_solver(setup.model, given, np.zeros(size), wanted, values), given, values))
+            parts.append((ContactSolver(setup.model, given, np.zeros(size), wanted, values), given, values))
         return parts[number]
 
     def estimate(currents: FloatArray) -> FloatArray:

@@ -32,8 +32,9 @@ import numpy.typing as npt
 
 from benchmarks.page import Report, options, progress
 from handtouch.config import Deployment, parse
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, ContactSolver, make_solver
 from handtouch.core.stages import solve
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import (
     ConeSurface,
@@ -496,7 +497,7 @@ def core(share: float) -> Iterator[Worst]:
     model = build_pad_model(deployment)
     exact, pads = ExactPads(deployment, model), np.arange(model.size)
     currents, values = np.zeros((model.size, 4)), np.full((model.size, VALUE_COUNT), np.nan)
-    solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
     rng = np.random.default_rng(7)
     middle = exact.sides.T / 2
     placed = exact.to_link_frame(pads, middle[0], middle[1], np.zeros((model.size, 2, 2)))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from docs.stage_rows import rows_pxd
 from docs.wire_tables import STATUS_HEADS, schema_text, with_tables
-from handtouch.core.stages.solve import VALUE_SLICES
+from handtouch.core.stages.rows import VALUE_SLICES
 from handtouch.wire.columns import Column, vector_length
 from handtouch.wire.contact import Contact, ContactEvent, ContactPart, HandFrameHead
 from handtouch.wire.declarations import FieldDeclaration, declared_fields

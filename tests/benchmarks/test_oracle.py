@@ -12,7 +12,8 @@ from benchmarks.hand_touches import REST_S, SAMPLE_S, STEP_S, draw_touches
 from benchmarks.oracle import OracleCovariances, PadOracle
 from handtouch import config
 from handtouch.config import load, shipped
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
@@ -180,7 +181,7 @@ def test_positions_are_nearly_as_certain_as_can_be_after_32_contacts(deployment:
     best = oracle.with_contacts(np.stack([u, v, force_n]), contact_noise_a(model, 0))
     model.set_calibration(0, learnt.calibration)
     currents_a, values = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan)
-    solver = make_solver(model, currents_a, np.zeros(1), np.ones(1, np.bool_), values)
+    solver = ContactSolver(model, currents_a, np.zeros(1), np.ones(1, np.bool_), values)
     stated = []
     for truth in at:
         values[:] = np.nan

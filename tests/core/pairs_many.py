@@ -8,8 +8,9 @@ import sys
 import numpy as np
 
 from handtouch.config import load, shipped
-from handtouch.core.contact_solver import PARTS_COUNT, VALUE_COUNT, make_solver
 from handtouch.core.stages import solve
+from handtouch.core.stages.rows import PARTS_COUNT, VALUE_COUNT
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 
 _PAD = 1
@@ -21,7 +22,7 @@ def main(count: int) -> None:
     network, pads = model.networks[_PAD], model.size
     currents, values = np.zeros((pads, 6)), np.full((pads, VALUE_COUNT), np.nan)
     parts = np.full((pads, PARTS_COUNT), np.nan)
-    solver = make_solver(model, currents, np.zeros(pads), np.ones(pads, np.bool_), values, parts)
+    solver = ContactSolver(model, currents, np.zeros(pads), np.ones(pads, np.bool_), values, parts)
     digest, found = hashlib.sha256(), 0
     for _ in range(-(-count // 20)):
         x, y = rng.uniform(0.05, 0.95, (2, 2)) * [[network.a], [network.b]]

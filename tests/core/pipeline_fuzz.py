@@ -31,7 +31,7 @@ from handtouch.core.events import (
 )
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField
-from handtouch.core.stages.solve import VALUE_SLICES
+from handtouch.core.stages.rows import VALUE_SLICES
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.wire import ForceStatus, PadState, PositionStatus

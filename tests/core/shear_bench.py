@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from handtouch.config import Deployment, Shear, parse
-from handtouch.core.contact_solver import VALUE_SLICES
 from handtouch.core.shear_pads import shear_parameters
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.core.stages.rows import MOUNT_COUNT, VALUE_SLICES
 from handtouch.core.stages.shear import ShearForces, ShearTable
-from handtouch.core.stages.solve import MOUNT_COUNT
 from handtouch.core.state import TickState
 from handtouch.field.shear_estimate import ShearPad
 from handtouch.hand import mount_transform

@@ -10,9 +10,10 @@ import numpy as np
 from handtouch.calibration.calibration import LawParameters
 from handtouch.config import parse
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.stages import solve
+from handtouch.core.stages.rows import VALUE_COUNT
 from handtouch.core.stages.slip import SlipDetector
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.core.state import TickState
 from handtouch.daemon.table_cache import build_pad_model
 from tests.core.conftest import TOLERANT_DEPLOYMENT
@@ -28,7 +29,7 @@ def main(count: int) -> None:
     model.set_calibration(1, ActiveCalibration("1-1", (1.01, 0.99, 1.0, 1.02), law, by_gain))
     currents, values = np.zeros((n, 4)), np.full((n, VALUE_COUNT), np.nan)
     offset_std = np.full(n, 1e-7)
-    solver = make_solver(model, currents, offset_std, np.ones(n, np.bool_), values)
+    solver = ContactSolver(model, currents, offset_std, np.ones(n, np.bool_), values)
     summed_a, times = np.zeros(n), np.zeros(n, dtype=np.int64)
     slip = SlipDetector(5e-3, values, summed_a, times, np.ones(n, dtype=np.uint32), TickState.empty(n))
     slip.set_requested(np.ones(n, dtype=np.bool_))

@@ -16,7 +16,8 @@ from scipy.sparse import csc_matrix, diags, eye, kron
 from scipy.sparse.linalg import SuperLU, splu
 
 from handtouch.config import Deployment, parse
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.contact_patch import discs
 from handtouch.simulate.scenario import Scenario
@@ -77,7 +78,7 @@ def solved_currents(x_mm: float, y_mm: float, force_n: float, tilt: float = 0.0)
 def solved(currents_a: FloatArray, stated: Deployment) -> FloatArray:
     """Return the values (VALUE_COUNT,) of a contact with these currents (4,)."""
     model, values = build_pad_model(stated), np.full((1, VALUE_COUNT), np.nan)
-    make_solver(model, currents_a[None], np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
+    ContactSolver(model, currents_a[None], np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
         np.arange(1).data
     )
     return np.asarray(values[0])

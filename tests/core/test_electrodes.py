@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from handtouch import wire
 from handtouch.client.subscriber import columns
 from handtouch.config import ConfigError, parse
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.events import decode_calibration, encode_calibration
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.core.state import TickState
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ContactLaw
@@ -55,7 +56,9 @@ def test_three_currents_locate_a_contact_beside_a_pad_of_four(model: PadModel) -
         fractions = network.fractions(place[0] * network.a, place[1] * network.b)
         currents[row, : len(fractions)] = 2e-3 * fractions
     values = np.full((2, VALUE_COUNT), np.nan)
-    make_solver(model, currents, np.zeros(2), np.ones(2, np.bool_), values).solve_contacts(np.arange(2).data)
+    ContactSolver(model, currents, np.zeros(2), np.ones(2, np.bool_), values).solve_contacts(
+        np.arange(2).data
+    )
     sides = np.array([(network.a, network.b) for network in model.networks])
     np.testing.assert_allclose(values[:, VALUE_SLICES["xy"]] / sides, at, atol=1e-4)
     assert np.isfinite(values[:, VALUE_SLICES["force_n"]]).all()
@@ -99,7 +102,7 @@ def solved(model: PadModel, fractions: NDArray[np.float64], total_a: float) -> N
     """Return the contact values of the disc with these currents."""
     currents, values = np.zeros((2, model.channels)), np.full((2, VALUE_COUNT), np.nan)
     currents[1, : len(fractions)] = total_a * fractions
-    solver = make_solver(model, currents, np.zeros(2), np.ones(2, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(2), np.ones(2, np.bool_), values)
     solver.solve_contacts(np.array([1]).data)
     return np.asarray(values[1])
 

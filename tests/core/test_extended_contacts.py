@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch import config
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ForceEstimateStatus
 from handtouch.simulate.contact_patch import PROFILES, discs
@@ -42,7 +43,7 @@ def solve(model: PadModel, currents: FloatArray, pad: int = 0) -> dict[str, Floa
     """Return the values of contacts with these currents (n, c) on a pad, each by itself."""
     every, rows = np.zeros((model.size, model.channels)), []
     values = np.full((model.size, VALUE_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    solver = ContactSolver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
     for own in currents:
         every[pad], values[pad] = own, np.nan
         solver.solve_contacts(np.full(1, pad, np.intp).data)

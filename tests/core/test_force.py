@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import parse
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.stages import force
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.contact_law import ContactLaw, ForceEstimateStatus
 from tests.core.conftest import TOLERANT_DEPLOYMENT
@@ -30,7 +31,7 @@ def solve(model: PadModel, currents: FloatArray) -> tuple[float, float, int]:
 def solve_each(model: PadModel, currents: FloatArray) -> FloatArray:
     """Return the same (n, 3) of contacts with these currents (n, 4), one after the other."""
     every, values = np.zeros((model.size, 4)), np.full((model.size, VALUE_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    solver = ContactSolver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values)
     found = []
     for own in currents:
         every[0], values[0] = own, np.nan

@@ -9,8 +9,9 @@ import pytest
 
 from handtouch.calibration.calibration import LawParameters
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import contact_law, law_of
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from tests.procedures.test_calibrate import TRUE, Table, deployed, fitted, weights
 
@@ -31,7 +32,7 @@ def test_confidence_intervals_of_forces_cover_the_truth_in_95_percent_of_session
     for seed in range(500, 500 + sessions):
         found_law = fitted(Table(weights(), seed).readings()).law
         model.set_calibration(0, ActiveCalibration("4711-1", law=found_law))
-        solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
         for number, (force_n, total_a) in enumerate(zip(FORCES, totals_a, strict=True)):
             currents[0] = total_a * fractions
             solver.solve_contacts(np.zeros(1, np.intp).data)
@@ -50,7 +51,7 @@ def test_the_std_of_a_force_includes_the_covariance_of_a_calibrated_law(bench: A
         currents = np.zeros((3, 4))
         currents[0] = bench.counts(0, 0.5, 0.5, 1e-3) * model.ampere_per_count[0]
         values = np.full((3, VALUE_COUNT), np.nan)
-        solver = make_solver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
         solver.solve_contacts(np.zeros(1, np.intp).data)
         results.append((values[0, VALUE_SLICES["force_n"]][0], values[0, VALUE_SLICES["force_std_n"]][0]))
     (force, exact_std), (same, std) = results

@@ -13,7 +13,7 @@ from handtouch import wire
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.stages.publish import ContactEncoder
-from handtouch.core.stages.solve import VALUE_SLICES
+from handtouch.core.stages.rows import VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.wire import ForceStatus, FrameStatus, PositionStatus
 from handtouch.wire.status import MAX_SILENT_PERIODS

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from handtouch import config, wire
 from handtouch.config import load, shipped
-from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, PARTS_COUNT, VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import ChannelField
+from handtouch.core.stages.rows import PART_COUNT, PART_SLICES, PARTS_COUNT, VALUE_COUNT
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.hand import pad_surface
 from handtouch.simulate.scenario import Scenario
@@ -59,7 +60,7 @@ def solved(model: PadModel, currents: FloatArray) -> FloatArray:
     """Return the two contacts (k, 2, PART_COUNT) of each of k samples of the pad's six currents (k, 6)."""
     every, values = np.zeros((model.size, 6)), np.full((model.size, VALUE_COUNT), np.nan)
     parts = np.full((model.size, PARTS_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
+    solver = ContactSolver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
     found = []
     for row in currents:
         every[PAD], values[:] = row, np.nan
@@ -191,7 +192,7 @@ def test_two_contacts_keep_their_order_and_ids_through_samples_with_one(model: P
     network, rng = model.networks[PAD], np.random.default_rng(3)
     every, values = np.zeros((model.size, 6)), np.full((model.size, VALUE_COUNT), np.nan)
     parts = np.full((model.size, PARTS_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
+    solver = ContactSolver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
     x, y = np.array([0.25, 0.75]) * network.a, np.array([0.3, 0.7]) * network.b
     found, fractions = [], network.fractions(x, y).T
     for step in range(300):
@@ -214,7 +215,7 @@ def test_a_contact_at_another_place_has_another_id(model: PadModel) -> None:
     network = model.networks[PAD]
     every, values = np.zeros((model.size, 6)), np.full((model.size, VALUE_COUNT), np.nan)
     parts = np.full((model.size, PARTS_COUNT), np.nan)
-    solver = make_solver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
+    solver = ContactSolver(model, every, np.zeros(model.size), np.ones(model.size, np.bool_), values, parts)
     seen = []
     for place in ((0.8, 0.8), None, (0.8, 0.2)):
         for _ in range(5):

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.config import Deployment, load, parse, shipped
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.field.measured import PressTable
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.field.taxels import TaxelArray
@@ -75,7 +76,7 @@ def located(model: PadModel, signals: FloatArray, unit: float) -> tuple[FloatArr
         currents = np.zeros((model.size, model.channels))
         values = np.full((model.size, VALUE_COUNT), np.nan)
         currents[0, : len(one)] = unit * one
-        solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
         solver.solve_contacts(view_memory(np.array([0])))
         found[number] = values[0, VALUE_SLICES["pad_m"]]
         spread[number] = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)[:2, :2]

@@ -13,9 +13,10 @@ from benchmarks.untouched_zeros import Zeros, play_zeros
 from handtouch.config import Deployment, load, shipped
 from handtouch.config.responses import Taxels
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.field.channel_map import ChangedMap, ChannelMap
 from handtouch.hand import models_with_other_parts, part_stds
 from handtouch.simulate.scenario import Scenario
@@ -40,7 +41,7 @@ def solved(model: PadModel, row: int, signals: FloatArray) -> FloatArray:
     """Return the values of a contact with these signals on a pad."""
     currents, values = np.zeros((model.size, model.channels)), np.full((model.size, VALUE_COUNT), np.nan)
     currents[row, : len(signals)] = signals
-    solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
     solver.solve_contacts(view_memory(np.array([row])))
     return np.asarray(values[row])
 

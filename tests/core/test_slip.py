@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
 from handtouch.core.stages.slip import INFORMATION, MOTION_CLASSES, GripModel, SlipDetector
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
 from handtouch.core.state import TickState
 
 FloatArray = NDArray[np.float64]

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from handtouch.config import parse
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field import estimate
 from handtouch.field.contact_law import ForceEstimateStatus
@@ -33,7 +35,7 @@ class Contacts:
         self._currents, self._values = np.zeros((3, 4)), np.full((3, VALUE_COUNT), np.nan)
         requested = np.full(3, force_requested)
         measured = {} if noise_squared is None else {"noise_squared": noise_squared}
-        self._solver = make_solver(
+        self._solver = ContactSolver(
             model, self._currents, np.zeros(3), requested, self._values, measured=measured
         )
 
@@ -263,7 +265,9 @@ def test_contacts_on_a_pad_whose_electrodes_touch_are_located() -> None:
     at = np.array([0.3, 0.6]) * (network.a, network.b)
     values = np.full((1, VALUE_COUNT), np.nan)
     currents = 2e-3 * network.fractions(*at)[None]
-    make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(np.arange(1).data)
+    ContactSolver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
+        np.arange(1).data
+    )
     np.testing.assert_allclose(values[0, VALUE_SLICES["xy"]], at, atol=1e-6)
     covariance = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)
     assert 0 < np.trace(covariance) < 1e-6
@@ -277,7 +281,9 @@ def test_of_two_maxima_beside_a_bare_corner_the_more_likely_one_is_found(place: 
     at = np.multiply(place, (network.a, network.b))
     values = np.full((1, VALUE_COUNT), np.nan)
     currents = 1e-3 * network.fractions(*at)[None]
-    make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(np.arange(1).data)
+    ContactSolver(model, currents, np.zeros(1), np.ones(1, np.bool_), values).solve_contacts(
+        np.arange(1).data
+    )
     variance = np.trace(values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3))
     assert np.sum((values[0, VALUE_SLICES["xy"]] - at) ** 2) < variance < 1e-6
 

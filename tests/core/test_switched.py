@@ -7,16 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
-from handtouch.core.contact_solver import (
-    PART_COUNT,
-    PART_SLICES,
-    PARTS_COUNT,
-    VALUE_COUNT,
-    VALUE_SLICES,
-    make_solver,
-)
 from handtouch.core.pad_model import PadModel
 from handtouch.core.slab import ChannelField, Slab
+from handtouch.core.stages.rows import PART_COUNT, PART_SLICES, PARTS_COUNT, VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.touch import ScenarioTouch
@@ -36,7 +30,7 @@ def solve(model: PadModel, *samples: FloatArray, settled: int = 1) -> tuple[Floa
     """Return values and parts of the tip for currents (8,) [A], one sample after the other."""
     currents = np.zeros((2, model.channels))
     values, parts = np.full((2, VALUE_COUNT), np.nan), np.full((2, PARTS_COUNT), np.nan)
-    solver = make_solver(model, currents, np.zeros(2), np.ones(2, np.bool_), values, parts)
+    solver = ContactSolver(model, currents, np.zeros(2), np.ones(2, np.bool_), values, parts)
     for sample in samples:
         currents[0] = sample
         for _ in range(settled):

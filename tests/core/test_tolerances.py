@@ -12,8 +12,10 @@ from scipy.stats import chi2
 from handtouch.calibration.calibration import LearnedParts, matrix
 from handtouch.config import Deployment, parse
 from handtouch.core.active_calibration import ActiveCalibration
-from handtouch.core.contact_solver import MAX_SQUARED_MISFIT, VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand import electrode_network, part_stds
@@ -168,7 +170,7 @@ def test_two_contacts_along_a_side_are_no_point_and_their_covariance_includes_th
         for net, a, b in zip(networks, side_x, side_y, strict=True)
     ]
     currents, values = 1e-3 * np.array(pair), np.full((3, VALUE_COUNT), np.nan)
-    solver = make_solver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
     solver.solve_contacts(np.arange(3).data)
     assert (values[:, VALUE_SLICES["squared_misfit"]] > MAX_SQUARED_MISFIT).all()
     longest = np.linalg.eigvalsh(values[:, VALUE_SLICES["covariance_m2"]].reshape(3, 3, 3))[:, -1]
@@ -181,7 +183,7 @@ def shares_in_their_regions(model: PadModel, network: ElectrodeNetwork) -> tuple
     rng, values = np.random.default_rng(7), np.full((3, VALUE_COUNT), np.nan)
     currents, misfits = np.zeros((3, 4)), np.zeros((3, 3))
     requested, measured = np.ones(3, np.bool_), {"misfits": misfits}
-    solver = make_solver(model, currents, np.zeros(3), requested, values, measured=measured)
+    solver = ContactSolver(model, currents, np.zeros(3), requested, values, measured=measured)
     (a, b), inside, means = sides([network])[0], [], []
     for _ in range(30):
         misfits[:] = 0.0
@@ -232,7 +234,7 @@ def solve(
     currents, values = gains * 2e-3 * fractions, np.full((3, VALUE_COUNT), np.nan)
     if rng:
         currents += model.noise_a * rng.normal(size=(3, 4))
-    solver = make_solver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(3), np.ones(3, np.bool_), values)
     solver.solve_contacts(np.arange(3).data)
     columns = [values[:, VALUE_SLICES[name]] for name in ("covariance_m2", "position_m", "normal")]
     return columns[0].reshape(3, 3, 3), columns[1], columns[2]
@@ -266,7 +268,7 @@ def test_weak_contacts_on_a_long_pad_lie_in_the_stated_regions() -> None:
     model, rng = build_pad_model(deployment), np.random.default_rng(2)
     currents, values, distances = np.zeros((1, 4)), np.full((1, VALUE_COUNT), np.nan), []
     exact = ExactPads(deployment, model)
-    solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
     for _ in range(25):
         network, gains = drawn_network(deployment, 0, rng), np.exp(rng.normal(0, 0.0115, 4))
         for x, y, log_total in rng.uniform((0.05, 0.05, -4.6), (0.95, 0.95, -4.0), (16, 3)):

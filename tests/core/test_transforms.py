@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from handtouch.config import load, shipped
 from handtouch.core.columns import PadColumns, TickResult
-from handtouch.core.contact_solver import PART_COUNT
 from handtouch.core.stages.frames import ContactTransforms
 from handtouch.core.stages.kinematics import LinkPose, LinkPoses
+from handtouch.core.stages.rows import PART_COUNT
 from handtouch.core.state import TickState
 from handtouch.hand.joints import JointSnapshot, JointStateBuffer
 from handtouch.hand.robot_models import RobotModels

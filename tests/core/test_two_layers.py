@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from handtouch.config import Deployment, parse, shipped
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.surface import PlaneSurface
 from handtouch.field.two_layers import TwoLayers
@@ -67,7 +68,7 @@ def test_contacts_are_found_where_they_are_solved(deployment: Deployment, model:
         assert signals[:2].sum() == pytest.approx(signals[2:].sum())
         currents, values = np.zeros((model.size, 4)), np.full((model.size, VALUE_COUNT), np.nan)
         currents[row] = signals
-        solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
         solver.solve_contacts(view_memory(np.array([row])))
         x, y = values[row, VALUE_SLICES["xy"]]
         assert (x / network.a, y / network.b) == pytest.approx((s, t), abs=4e-3)
@@ -81,7 +82,7 @@ def test_two_contacts_have_the_centroid_of_their_currents(model: PadModel) -> No
     for (s, t), current in (one, other):
         currents[1] += 5e-5 * current * network.fractions(s * network.a, t * network.b)
     values = np.full((model.size, VALUE_COUNT), np.nan)
-    solver = make_solver(model, currents, np.zeros(model.size), np.zeros(model.size, np.bool_), values)
+    solver = ContactSolver(model, currents, np.zeros(model.size), np.zeros(model.size, np.bool_), values)
     solver.solve_contacts(view_memory(np.array([1])))
     x, y = values[1, VALUE_SLICES["xy"]]
     assert (x / network.a, y / network.b) == pytest.approx((0.6, 0.7), abs=2e-3)

@@ -10,9 +10,10 @@ import pytest
 
 from handtouch.cli import main
 from handtouch.config import load, parse, shipped
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.design.films import FILM_OHM, LEAD_STD_OHM, film_position_std
 from handtouch.design.goals import position_std
 from handtouch.design.pad_task import PadTask
@@ -58,7 +59,7 @@ def test_what_is_advised_of_two_films_is_what_the_daemon_states_of_them() -> Non
     for place, expected in zip(np.stack(pad.grid, axis=1), advised, strict=True):
         currents, values = np.zeros((1, model.channels)), np.full((1, VALUE_COUNT), np.nan)
         currents[0] = model.centre_current(0, 1.0) / 2 * model.networks[0].fractions(*place)
-        solver = make_solver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(1), np.ones(1, np.bool_), values)
         solver.solve_contacts(view_memory(np.array([0])))
         covariance = values[0, VALUE_SLICES["covariance_m2"]].reshape(3, 3)
         assert np.sqrt(covariance.trace()) == pytest.approx(expected, rel=0.05)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
 from handtouch.core.stages.slip import MOTION_CLASSES, SlipDetector
-from handtouch.core.stages.solve import VALUE_COUNT, VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.percept.motion import MotionReporter
 from handtouch.percept.samples import ContactBuffer, ContactSamples, PerceptEstimate

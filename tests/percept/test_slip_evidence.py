@@ -13,8 +13,8 @@ from handtouch.core.stages.evidence import (
     OTHERS_WEIGHT,
     SLIP_FEATURES,
 )
+from handtouch.core.stages.rows import VALUE_COUNT
 from handtouch.core.stages.slip import SLIP_SLICES, SlipDetector
-from handtouch.core.stages.solve import VALUE_COUNT
 from handtouch.core.state import TickState
 from handtouch.percept.samples import ContactBuffer, ContactSamples
 from handtouch.percept.slip_evidence import SlipEvidence, SlipTrees

@@ -31,8 +31,9 @@ from handtouch.cli.simulate import add_grasp, add_scenario, add_world
 from handtouch.client import Subscriber, connect
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.compiled import Compilation
-from handtouch.core.contact_solver import VALUE_COUNT, make_solver
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.daemon.daemon import HandtouchDaemon
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.host.endpoints import COMPLETE_ENDPOINT, CONTROL_ENDPOINT, INPUTS_ENDPOINT, LIVE_ENDPOINT
@@ -352,7 +353,7 @@ def solving_time_s(model: PadModel) -> float:
     currents *= _CONTACT_RADII * model.begin_threshold_a[:, None]
     values = np.full((model.size, VALUE_COUNT), np.nan)
     requested = np.ones(model.size, dtype=np.bool_)
-    solver = make_solver(model, currents, np.zeros(model.size), requested, values)
+    solver = ContactSolver(model, currents, np.zeros(model.size), requested, values)
     pads = np.arange(model.size, dtype=np.intp).data
     times_s = []
     for _ in range(_TRIALS):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handtouch.arrays import FloatArray, IntArray
-from handtouch.core.stages.solve import VALUE_SLICES
+from handtouch.core.stages.rows import VALUE_SLICES
 from handtouch.core.state import TickState
 from handtouch.wire import COLUMNS, HandFrame
 

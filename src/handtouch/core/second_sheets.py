@@ -17,7 +17,7 @@ from handtouch.core.pad_model import PadModel
 from handtouch.core.sheet_force import SheetForceCompensation
 from handtouch.core.slab import Slab
 from handtouch.core.stages.force import PadLaw
-from handtouch.core.stages.solve import VALUE_ROW, VALUE_SLICES
+from handtouch.core.stages.rows import VALUE_ROW, VALUE_SLICES
 from handtouch.core.stages.two_sheets import (
     MAX_EQUAL_SAMPLES,
     TwoSheets,

@@ -20,8 +20,15 @@ from numpy.typing import NDArray
 
 from handtouch.arrays import BoolArray, FloatArray
 from handtouch.core.memory import row_count, view_memory
-from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES, SHEAR_CHANNELS, SLIP_ROW
-from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
+from handtouch.core.stages.rows import (
+    CONTACT_FRAMES,
+    MISFIT_COUNT,
+    PART_FRAMES,
+    PART_ROW,
+    SHEAR_CHANNELS,
+    SLIP_ROW,
+    VALUE_ROW,
+)
 from handtouch.sheet import BANK_MODELS, BANK_WINDOW
 from handtouch.wire import PadState
 

@@ -12,15 +12,16 @@ from handtouch.arrays import BoolArray, IntArray
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.baseline import Baseline, BaselineSettings
 from handtouch.core.columns import PadColumns, TickResult
-from handtouch.core.contact_solver import PART_COUNT, PART_SLICES, make_solver
 from handtouch.core.pad_model import PadModel
 from handtouch.core.second_sheets import SecondSheets
 from handtouch.core.shear_pads import changed_shear_pads
 from handtouch.core.sheet_force import ForceReference, SheetForceCompensation
 from handtouch.core.stages.detect import ContactDetector, DetectionSettings
 from handtouch.core.stages.publish import ContactColumns
+from handtouch.core.stages.rows import PART_COUNT, PART_SLICES
 from handtouch.core.stages.shear import ShearForces, ShearTable
 from handtouch.core.stages.slip import SlipDetector
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.core.state import TickState
 from handtouch.wire import PadState
 
@@ -168,7 +169,7 @@ class TickProcessor:
             "noise_squared": self.state.noise_squared,
             "misfits": self.state.misfits,
         }
-        self.solver = make_solver(
+        self.solver = ContactSolver(
             model,
             currents=self.contacts.currents_a,
             offset_std_a=self.contacts.offset_std_a,

@@ -20,8 +20,8 @@ from handtouch.config import Deployment, ObjectTable
 from handtouch.core.columns import TickResult
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.scene import RequestedOutputs
+from handtouch.core.stages.rows import VALUE_SLICES
 from handtouch.core.stages.slip import SLIP_SLICES
-from handtouch.core.stages.solve import VALUE_SLICES
 from handtouch.daemon.child_process import ChildProcess, child_statistics
 from handtouch.percept.messages import PerceptMessageError, PerceptStatus, pack_message, unpack_output
 from handtouch.wire import PERCEPT_KINDS, ContactRadiusStatus, ForceStatus, PadState, PositionStatus

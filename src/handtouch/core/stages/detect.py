@@ -11,7 +11,7 @@ import numpy as np
 
 from handtouch.core.memory import view_memory
 from handtouch.core.stages.receive import SampleMemory
-from handtouch.core.stages.solve import VALUE_COUNT
+from handtouch.core.stages.rows import VALUE_COUNT
 from handtouch.wire.status import MAX_SILENT_PERIODS, PadState
 
 if TYPE_CHECKING:

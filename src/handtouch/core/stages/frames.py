@@ -12,8 +12,7 @@ import numpy as np
 from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
 from handtouch.core.stages import kinematics
 from handtouch.core.stages.groups import ContactGroups
-from handtouch.core.stages.rows import CONTACT_FRAMES, FRAME_ROW, PART_FRAMES
-from handtouch.core.stages.solve import PART_ROW, VALUE_ROW
+from handtouch.core.stages.rows import CONTACT_FRAMES, FRAME_ROW, PART_FRAMES, PART_ROW, VALUE_ROW
 from handtouch.hand.joints import JointSnapshot
 from handtouch.wire.status import FrameStatus
 

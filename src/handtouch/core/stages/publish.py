@@ -19,8 +19,7 @@ from handtouch.core.columns import PUBLISHED, PadColumns
 from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages.force import BOUNDED, WIDE
-from handtouch.core.stages.rows import CONTACT_FRAMES, PART_FRAMES
-from handtouch.core.stages.solve import MISFIT_COUNT, PART_ROW, VALUE_ROW
+from handtouch.core.stages.rows import CONTACT_FRAMES, MISFIT_COUNT, PART_FRAMES, PART_ROW, VALUE_ROW
 from handtouch.wire import ContactEvent, EndReason
 from handtouch.wire.status import (
     MAX_SILENT_PERIODS,

@@ -1,7 +1,9 @@
-"""Rows of named numbers: contacts in the palm and base frames and their slip, settings of a pad.
+"""Rows of named numbers: contacts, also in the palm and base frames, their slip; settings of a pad.
 
-Public names: `FRAME_ROW`, `PART_FRAMES`, `CONTACT_FRAMES`, `SLIP_ROW`, `SLIP_ONSETS`, `SLIP_RAMP_BLOCKS`,
-`SHEAR_CHANNELS`, `TOUCH_ROW`. They are here, since the stages that write them take the state.
+Public names: `VALUE_ROW`, `VALUE_SLICES`, `VALUE_COUNT`, `PART_ROW`, `PART_SLICES`, `PART_COUNT`,
+`PARTS_COUNT`, `MOUNT_ROW`, `MOUNT_COUNT`, `MISFIT_ROW`, `MISFIT_COUNT`, `FRAME_ROW`, `PART_FRAMES`,
+`CONTACT_FRAMES`, `SLIP_ROW`, `SLIP_ONSETS`, `SLIP_RAMP_BLOCKS`, `SHEAR_CHANNELS`, `TOUCH_ROW`. They are here,
+since the stages that write them take the state or the model.
 """
 
 from __future__ import annotations
@@ -9,7 +11,71 @@ from __future__ import annotations
 import numpy as np
 
 from handtouch.config import Touch
-from handtouch.core.memory import number_row
+from handtouch.core.memory import number_row, row_count, slices_of
+
+VALUE_ROW = np.dtype(
+    [
+        ("xy", "<f8", 2),  # on the pad's rectangle
+        ("pad_m", "<f8", 2),
+        ("residual", "<f8"),
+        ("position_m", "<f8", 3),
+        ("normal", "<f8", 3),
+        ("force_n", "<f8"),
+        ("force_std_n", "<f8"),
+        ("residual_std", "<f8"),  # from channel noise and baseline
+        ("covariance_m2", "<f8", 9),  # without that of the mount
+        ("mount_covariance_m2", "<f8", 9),
+        ("pad_noise_m2", "<f8", 3),  # of pad_m from channel noise: uu, uv, vv
+        ("force_status", "<f8"),  # of `stages.force`
+        ("cells", "<f8", 2),  # position in the pad's table, where the next tick starts from
+        ("squared_misfit", "<f8"),  # of a point, see MAX_SQUARED_MISFIT
+        ("is_bound", "<f8"),  # 1 where saturated channels leave the position open
+        ("contact_radius_m", "<f8"),
+        ("contact_radius_std_m", "<f8"),
+        ("contact_radius_status", "<f8"),  # ContactRadiusStatus
+        ("length_m", "<f8"),  # of its elongation, see `stages.elongation`
+        ("min_length_m", "<f8"),
+        ("max_length_m", "<f8"),
+        ("length_axis", "<f8", 3),
+        ("length_axis_std_rad", "<f8"),
+    ]
+)
+VALUE_SLICES = slices_of(VALUE_ROW)
+"""Layout of a row of values."""
+VALUE_COUNT = row_count(VALUE_ROW)
+PART_ROW = np.dtype(
+    [
+        ("position_m", "<f8", 3),
+        ("normal", "<f8", 3),
+        ("covariance_m2", "<f8", 9),
+        ("force_n", "<f8"),
+        ("force_std_n", "<f8"),
+        ("id", "<f8"),  # this and the following stay while there is one contact
+        ("place", "<f8", 2),  # on the pad's rectangle
+        ("newest_id", "<f8"),  # of the pad, in the first of two
+    ]
+)
+PART_SLICES = slices_of(PART_ROW)
+"""Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
+PART_COUNT, PARTS_COUNT = row_count(PART_ROW), 2 * row_count(PART_ROW)
+MOUNT_ROW = np.dtype(
+    [
+        ("origin_m", "<f8", 3),  # of the pad on its link
+        ("position_variance_m2", "<f8"),  # of that along each axis
+        ("rotation_variance_rad2", "<f8"),  # and about it
+    ]
+)
+"""A pad's mount"""
+MOUNT_COUNT = row_count(MOUNT_ROW)
+MISFIT_ROW = np.dtype(
+    [
+        ("mean_square", "<f8"),  # running mean of the squared misfits of the contacts before
+        ("weighted_sum", "<f8"),  # of the last: sum of those of its samples, times the square of the current
+        ("weight_sum", "<f8"),  # sum of these squares
+    ]
+)
+"""Misfits of a pad's contacts"""
+MISFIT_COUNT = row_count(MISFIT_ROW)
 
 FRAME_ROW = np.dtype([("position_m", "<f8", 3), ("normal", "<f8", 3), ("covariance_m2", "<f8", 9)])
 """A contact in one frame"""

@@ -14,8 +14,7 @@ import numpy as np
 
 from handtouch.core.memory import RowArray, view_memory, view_rows
 from handtouch.core.stages.receive import SampleMemory
-from handtouch.core.stages.rows import SHEAR_CHANNELS
-from handtouch.core.stages.solve import MOUNT_COUNT, VALUE_ROW
+from handtouch.core.stages.rows import MOUNT_COUNT, SHEAR_CHANNELS, VALUE_ROW
 from handtouch.wire.status import ForceStatus, PadState, PositionStatus
 
 if TYPE_CHECKING:

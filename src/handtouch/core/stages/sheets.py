@@ -15,7 +15,7 @@ from handtouch.core.memory import RowArray, view_rows
 from handtouch.core.stages import loads
 from handtouch.core.stages.force import BOUNDED
 from handtouch.core.stages.loads import SheetInterval, SheetLoads
-from handtouch.core.stages.solve import VALUE_ROW
+from handtouch.core.stages.rows import VALUE_ROW
 from handtouch.field import contact_law
 
 if TYPE_CHECKING:

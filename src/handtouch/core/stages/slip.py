@@ -33,8 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from handtouch.core.memory import RowArray, row_count, slices_of, view_memory, view_rows
-from handtouch.core.stages.rows import SLIP_ONSETS, SLIP_RAMP_BLOCKS, SLIP_ROW
-from handtouch.core.stages.solve import VALUE_ROW
+from handtouch.core.stages.rows import SLIP_ONSETS, SLIP_RAMP_BLOCKS, SLIP_ROW, VALUE_ROW
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

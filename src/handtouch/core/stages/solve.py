@@ -1,86 +1,30 @@
 """Contacts of a tick: locate, estimate the force, place; one row of `values` a pad.
 
-Public names: `ContactSolver`, `VALUE_COUNT`, `VALUE_SLICES`, `MAX_SQUARED_MISFIT`, `PART_COUNT`,
-`PART_SLICES`, `PARTS_COUNT`, `MOUNT_COUNT`, `MISFIT_COUNT`.
+Public name: `ContactSolver`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from handtouch.core.memory import RowArray, row_count, slices_of, view_memory
+from handtouch.core.memory import RowArray, view_memory, view_rows
 from handtouch.core.pad_tables import MAX_SQUARED_MISFIT
 from handtouch.core.stages import elongation, force, locate, pairs, tables, tolerances, two_sheets
+from handtouch.core.stages.rows import MISFIT_COUNT, MISFIT_ROW, MOUNT_ROW, PART_ROW, PARTS_COUNT, VALUE_ROW
 from handtouch.field import contact_law
 from handtouch.wire.status import ContactRadiusStatus
 
-VALUE_ROW = np.dtype(
-    [
-        ("xy", "<f8", 2),  # on the pad's rectangle
-        ("pad_m", "<f8", 2),
-        ("residual", "<f8"),
-        ("position_m", "<f8", 3),
-        ("normal", "<f8", 3),
-        ("force_n", "<f8"),
-        ("force_std_n", "<f8"),
-        ("residual_std", "<f8"),  # from channel noise and baseline
-        ("covariance_m2", "<f8", 9),  # without that of the mount
-        ("mount_covariance_m2", "<f8", 9),
-        ("pad_noise_m2", "<f8", 3),  # of pad_m from channel noise: uu, uv, vv
-        ("force_status", "<f8"),  # of `stages.force`
-        ("cells", "<f8", 2),  # position in the pad's table, where the next tick starts from
-        ("squared_misfit", "<f8"),  # of a point, see MAX_SQUARED_MISFIT
-        ("is_bound", "<f8"),  # 1 where saturated channels leave the position open
-        ("contact_radius_m", "<f8"),
-        ("contact_radius_std_m", "<f8"),
-        ("contact_radius_status", "<f8"),  # ContactRadiusStatus
-        ("length_m", "<f8"),  # of its elongation, see `stages.elongation`
-        ("min_length_m", "<f8"),
-        ("max_length_m", "<f8"),
-        ("length_axis", "<f8", 3),
-        ("length_axis_std_rad", "<f8"),
-    ]
-)
-VALUE_SLICES = slices_of(VALUE_ROW)
-"""Layout of a row of values."""
-VALUE_COUNT = row_count(VALUE_ROW)
-PART_ROW = np.dtype(
-    [
-        ("position_m", "<f8", 3),
-        ("normal", "<f8", 3),
-        ("covariance_m2", "<f8", 9),
-        ("force_n", "<f8"),
-        ("force_std_n", "<f8"),
-        ("id", "<f8"),  # this and the following stay while there is one contact
-        ("place", "<f8", 2),  # on the pad's rectangle
-        ("newest_id", "<f8"),  # of the pad, in the first of two
-    ]
-)
-PART_SLICES = slices_of(PART_ROW)
-"""Layout of one of two contacts on a pad; a row of parts has two of them, NaN where there is one contact."""
-PART_COUNT, PARTS_COUNT = row_count(PART_ROW), 2 * row_count(PART_ROW)
-MOUNT_ROW = np.dtype(
-    [
-        ("origin_m", "<f8", 3),  # of the pad on its link
-        ("position_variance_m2", "<f8"),  # of that along each axis
-        ("rotation_variance_rad2", "<f8"),  # and about it
-    ]
-)
-"""A pad's mount"""
-MOUNT_COUNT = row_count(MOUNT_ROW)
-MISFIT_ROW = np.dtype(
-    [
-        ("mean_square", "<f8"),  # running mean of the squared misfits of the contacts before
-        ("weighted_sum", "<f8"),  # of the last: sum of those of its samples, times the square of the current
-        ("weight_sum", "<f8"),  # sum of these squares
-    ]
-)
-"""Misfits of a pad's contacts"""
-MISFIT_COUNT = row_count(MISFIT_ROW)
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from handtouch.arrays import BoolArray, FloatArray
+    from handtouch.core.pad_model import PadModel
+
 _NAN = float("nan")
 _FITTED, _BOUNDED, _WIDE = float(force.FITTED), float(force.BOUNDED), float(force.WIDE)
 _, _ESTIMATED, _ASSUMED, _CONTRADICTORY = map(float, ContactRadiusStatus)
@@ -117,49 +61,67 @@ _MAX_VARIANCE = 1.0 / 3.0  # of a position anywhere on a side, estimated at its 
 
 
 class ContactSolver:
-    """Solves contacts of the pads of a model.
+    """Solver of contacts on the pads of a model, which reads and writes these arrays in place.
 
-    models, pad_tolerances, laws, surfaces: of each pad. known: of gains and parts. both: `TwoSheets` of the
-    pads with two sheets, None without any.
+    currents: (pads, c) [A]; of the channels of the pad with most electrodes, a pad has as many as it has
+    electrodes. offset_std_a: (pads,) of the sum of the currents, from the baseline; it counts as noise of the
+    channels, shared among them. force_requested: (pads,), False where no force is to be estimated. values:
+    (pads, VALUE_COUNT), laid out as VALUE_SLICES, the result; NaN for a new contact, else the search begins
+    at the position in it. parts: (pads, PARTS_COUNT), twice PART_SLICES, NaN if there is one contact.
+    measured: by name, as far as known, `saturated` (pads, c), True where a current is a lower bound;
+    `noise_squared` (pads, c), variances of the channels as measured [counts^2]: where the stated noise is
+    larger, that counts; `misfits` (pads, MISFIT_COUNT). both: `TwoSheets` of the pads with two sheets.
 
-    arrays: memory by name, flat, with a row a pad; a pad reads of its c channels, as the pad with most
-    electrodes has, as many as it has electrodes. currents, weight: (pads c,) currents [A] and 1 / noise
-    [1/A]. offset_std_a: (pads,) of the sum of the currents, from the baseline; it counts as noise of the
-    channels, shared among them. force_requested: (pads,), 0 where no force is to be estimated. values:
-    (pads,) VALUE_ROWs, the result; NaN for a new contact, else the search
-    begins at the position in it. pair_limits: (pads,) squared misfit of one contact from which on two are
-    tried, infinite where they can't be resolved; moment_stds: (pads,) [m^2], that of an elongated contact,
-    see `tolerances.whiten_elongated`; parts: (2 pads,) PART_ROWs, of each pad two, NaN if there is one.
-    saturated: (pads c,), 1 where a current is a lower bound; peak_currents_a: (pads,) largest current of an
-    electrode by the firmest contact. mounts: (pads,) MOUNT_ROWs. misfits: (pads,) MISFIT_ROWs. crowding:
-    (pads,), 1 where currents crowd towards electrodes. ampere_per_count, noise_squared: (pads c,), variances
-    of the channels [counts^2] as measured; where the stated noise is larger, that counts.
+    Of the model: pair_limits, (pads,) squared misfit of one contact from which on two are tried, infinite
+    where they can't be resolved; moment_stds, (pads,) [m^2] of an elongated contact, see
+    `tolerances.whiten_elongated`; peak_currents_a, (pads,) largest current of an electrode by the firmest
+    contact; crowding, (pads,) 1 where currents crowd towards electrodes; weight, (pads, c) 1 / noise [1/A].
     """
 
     def __init__(
         self,
-        models: list[locate.ModelTable],
-        pad_tolerances: list[tolerances.PadTolerances],
-        laws: list[force.PadLaw],
-        surfaces: list[tables.PadSurface],
-        known: tolerances.PartKnowledge,
-        arrays: Mapping[str, Any],
+        model: PadModel,
+        currents: FloatArray,
+        offset_std_a: FloatArray,
+        force_requested: BoolArray,
+        values: FloatArray,
+        parts: FloatArray | None = None,
+        measured: Mapping[str, NDArray[Any]] = MappingProxyType({}),
         both: Any = None,
     ) -> None:
-        self.models, self.pad_tolerances = models, pad_tolerances
-        self.laws, self.surfaces = laws, surfaces
+        self.models, self.pad_tolerances = model.stage_tables(), model.stage_tolerances()
+        self.laws, self.surfaces = model.stage_laws(), model.surfaces
         self.both, self.has_both = both, both is not None
-        self.currents, self.weight, self.values = arrays["currents"], arrays["weight"], arrays["values"]
-        self.offset_std_a = arrays["offset_std_a"]
-        self.force_requested, self.saturated = arrays["force_requested"], arrays["saturated"]
-        self.pair_limits, self.moment_stds = arrays["pair_limits"], arrays["moment_stds"]
-        self.parts, self.misfits = arrays["parts"], arrays["misfits"]
-        self.peak_currents_a, self.mounts = arrays["peak_currents_a"], arrays["mounts"]
-        self.crowding, self.noise_squared = arrays["crowding"], arrays["noise_squared"]
-        self.ampere_per_count = arrays["ampere_per_count"]
-        self.electrodes = n = len(self.currents) // len(models)
+        if parts is None:
+            parts = np.full((model.size, PARTS_COUNT), np.nan)
+        given = {
+            "saturated": np.zeros(currents.shape, dtype=np.bool_),
+            "noise_squared": np.zeros(currents.shape),
+            "misfits": np.zeros((model.size, MISFIT_COUNT)),
+            **measured,
+        }
+        pair_limits, moment_stds = model.pair_settings()
+        self.currents, self.offset_std_a = view_memory(currents), view_memory(offset_std_a)
+        self.force_requested = view_memory(force_requested)
+        self.values, self.parts = view_rows(values, VALUE_ROW), view_rows(parts, PART_ROW)
+        self.saturated = view_memory(given["saturated"])
+        self.noise_squared = view_memory(given["noise_squared"])
+        self.misfits = view_rows(given["misfits"], MISFIT_ROW)
+        self.pair_limits, self.moment_stds = view_memory(pair_limits), view_memory(moment_stds)
+        self.peak_currents_a = view_memory(model.peak_currents_a)
+        self.mounts = view_rows(model.mounts, MOUNT_ROW)
+        self.weight, self.crowding = view_memory(model.weight), view_memory(model.crowding)
+        self.ampere_per_count = view_memory(model.ampere_per_count)
+        known = tolerances.PartKnowledge(
+            axes=model.part_axes,
+            ends=model.part_axis_ends,
+            offsets=model.part_offsets,
+            touch_errors=model.touch_errors,
+            gain_covariance=model.gain_covariance,
+        )
+        self.electrodes = n = currents.shape[1]
         self.stack = force.stack_table()
-        self.fit = locate.Fit(n, max(pad.states for pad in pad_tolerances), known)
+        self.fit = locate.Fit(n, max(pad.states for pad in self.pad_tolerances), known)
         self.placement, self.pair = tables.Placement(), pairs.PairFit(n)
         self.elongation, self.result = elongation.Elongation(n), force.ForceResult()
         self.part_law = force.empty_law()

@@ -17,9 +17,10 @@ import numpy as np
 from handtouch import config
 from handtouch.arrays import FloatArray
 from handtouch.config.responses import Measured
-from handtouch.core.contact_solver import VALUE_COUNT, VALUE_SLICES, make_solver
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_model import PadModel
+from handtouch.core.stages.rows import VALUE_COUNT, VALUE_SLICES
+from handtouch.core.stages.solve import ContactSolver
 from handtouch.field.channel_map import ChannelMap
 from handtouch.field.estimate import estimate
 from handtouch.field.measured import MIN_PRESSES, MeasuredMap, PressTable
@@ -182,7 +183,7 @@ class MapJob:
         model, row = self._model, self._row
         model.crowding[row] = crowding
         currents, values = np.zeros((model.size, model.channels)), np.empty((model.size, VALUE_COUNT))
-        solver = make_solver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
+        solver = ContactSolver(model, currents, np.zeros(model.size), np.ones(model.size, np.bool_), values)
         found = np.empty((len(signals), 2))
         for number, one in enumerate(signals):
             currents[row, : len(one)] = one / self._per_ampere
