@@ -21,16 +21,12 @@ presses are round.
 `default`, both pads of taxels.toml. *Drifting*: each channel's zero by the signal of 0.5 N and its gain by 10
 %, up in one hour, touches of 0.2 N every 30 s. *Turning*: magnetic ones, by 20 degrees in a second every 15
 s, which shifts channels by the signal of up to 0.1 N; 0.2 N at rest, 0.3 N in the second after a turn.
-
-*Tick* (`ARGS="--part tick"`): 15 pads of nine cells by turns with 15 of four electrodes in one process, all
-touched by contacts that slide, or none; processor time of a tick and of the preparation of the next.
 """
 
 from __future__ import annotations
 
 import os
 import tempfile
-import time
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,13 +52,9 @@ from benchmarks.hand_touches import (
 )
 from benchmarks.page import Report, options, progress
 from benchmarks.scores import Estimates, EstimateScore, Rate, Share, concatenate, slices
-from benchmarks.touched_pads import CURRENT_RATIO, PERIOD_NS
 from benchmarks.untouched_zeros import Found, Zeros, play_zeros
 from handtouch.config import Deployment, load, parse, shipped
 from handtouch.core.pad_model import PadModel
-from handtouch.core.pipeline import run_tick
-from handtouch.core.slab import CountSlab, Cycle
-from handtouch.core.tick import TickProcessor
 from handtouch.field.embedded_file import embed_file
 from handtouch.hand import mount_transform
 from handtouch.procedures.calibrate.press_map import MapJob, Place
@@ -74,8 +66,6 @@ from handtouch.simulate.worlds.spreads import ContactSpread
 PRESSES, PRESS_FORCES_N, PRESS_STD_MM, PRESS_SAMPLES = 60, (0.5, 2.0), 0.1, 15
 FIRST = 3  # touch that is sampled: zeros are known by then
 MOVING = {"drifting": Zeros(drift_n=0.5, gain_drift=0.1), "turning": Zeros(turn_n=0.1)}
-PADS, WARM_UP, MAX_TICK_RATIO = 15, 20, 2.5
-SLIDING_STEP = 0.005  # of a contact in a tick, over the pad's sides
 
 
 def larger() -> Deployment:
@@ -172,70 +162,6 @@ def rows_of(every: Estimates, quantity: str) -> list[dict[str, Any]]:
     return rows
 
 
-class TickDriver:
-    """Copies of the first pad of a deployment, all touched by sliding contacts, or none."""
-
-    def __init__(self, deployment: Deployment, is_touched: bool) -> None:
-        (hand, *_), (pad, *_) = deployment.hands, deployment.hands[0].pads
-        hands = [hand.model_copy(update={"name": f"hand{k}", "pads": (pad,)}) for k in range(PADS)]
-        self.model = PadModel(deployment.model_copy(update={"hands": tuple(hands)}))
-        self._touched = PADS * is_touched
-        channels = self.model.electrode_counts[0]
-        self._tick, self._cycle = TickProcessor(self.model, PERIOD_NS), Cycle(PERIOD_NS, 0.6)
-        self._slab = CountSlab(np.tile(np.array([-32768, 32767]), (PADS, channels, 1)))
-        self._up, self._t_ns = np.zeros(PADS, np.uint8), 10**9
-        self._chance = np.random.default_rng(PADS)
-        self._place, self._way = self._chance.uniform(0.3, 0.7, (2, PADS)), np.full((2, PADS), SLIDING_STEP)
-
-    def _counts(self) -> Any:
-        """Return the next sample (PADS, n)."""
-        model, network = self.model, self.model.networks[0]
-        self._place += self._way
-        self._way[(self._place < 0.2) | (self._place > 0.8)] *= -1
-        fractions = network.fractions(*(self._place * [[network.a], [network.b]])).T
-        centre = network.fractions(network.a / 2, network.b / 2).sum()
-        strength = (self._touched > 0) * CURRENT_RATIO * model.begin_threshold_a[0] / centre
-        counts = self._chance.normal(size=fractions.shape) + strength * fractions / model.ampere_per_count[0]
-        return np.rint(counts).astype(np.int64)
-
-    def tick_us(self) -> float:
-        """Run a tick and return its processor time."""
-        counts = self._counts()
-        self._t_ns += PERIOD_NS
-        self._slab.begin_cycle(self._t_ns)
-        self._cycle.begin_cycle(self._t_ns)
-        self._slab.store_counts(counts, self._t_ns + 1000)
-        begin_ns = time.thread_time_ns()
-        run_tick(self._tick, self._slab, self._up, self._cycle)
-        self._tick.prepare_next_tick()
-        return 1e-3 * (time.thread_time_ns() - begin_ns)
-
-    def check(self) -> None:
-        assert np.count_nonzero(self._tick.state.touching) == self._touched
-
-
-def measure_ticks(asked: Namespace) -> None:
-    """Measure ticks of pads of nine cells against those with four electrodes."""
-    ticks = 20 if asked.quick else 2000
-    report = Report(asked.quick, "tick", ticks=ticks)
-    rows = []
-    for is_touched in (False, True):
-        drivers = [
-            TickDriver(load(shipped.path(f"{name}.toml")), is_touched) for name in ("utah_mit", "taxels")
-        ]
-        us = np.array([[one.tick_us() for one in drivers] for _ in range(WARM_UP + ticks)])[WARM_UP:]
-        for driver in drivers:
-            driver.check()
-        low, ratio, high = np.percentile(us[:, 1] / us[:, 0], [25, 50, 75])
-        names = [f"{driver.model.electrode_counts[0]} channels, us" for driver in drivers]
-        medians = dict(zip(names, np.median(us, axis=0).tolist(), strict=True))
-        row = {"pads": PADS, "touched": PADS * is_touched, **medians}
-        rows.append(row | {"ratio": ratio, "quartiles": f"{low:.2f} to {high:.2f}"})
-    report.table("Tick of pads of nine cells and of four electrodes", rows)
-    report.limit(f"ratio of a tick, {PADS} contacts", rows[-1]["ratio"], MAX_TICK_RATIO)
-    report.keep()
-
-
 def measure_zeros(name: str, asked: Namespace) -> None:
     """Measure false contacts, and light touches, while zeros move in one way of `MOVING`."""
     fingers, hours = (1, 0.1) if asked.quick else (asked.moving, 1.0)
@@ -289,7 +215,6 @@ PARTS: dict[str, Callable[[Namespace], None]] = {
     "intervals": measure_intervals,
     "measured": measure_presses,
     **{name: partial(measure_zeros, name) for name in MOVING},
-    "tick": measure_ticks,
 }
 
 
