@@ -22,6 +22,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from benchmarks.page import Report, options
 from benchmarks.served_hand import processor_s
 from handtouch import config, wire
 from handtouch.config import shipped
-from tests.client.hand_messages import make_service
+from tests.client.hand_messages import make_contact, make_frame, make_service
 
 LINKS = tuple(pad.link for pad in config.load(shipped.path("utah_mit.toml")).hands[0].pads)
 PREFIX = "lab"
@@ -46,26 +47,11 @@ _SENTINEL = 0x7A5A5A5A5A5A5A5A
 
 def contact(hand: str, link: str) -> wire.Contact:
     """Return an update of a contact whose values are all known."""
-    return wire.Contact(
-        v=1, session=1, seq=1, t_ns=_SENTINEL, event="update", id=1, hand=hand, link=link, frame=link,
-        begin_ns=1, duration_s=1.0, age_s=0.0, position_m=(0.01, 0.0, 0.01), normal=(0.0, 0.0, 1.0),
-        covariance_m2=(1e-7, 0.0, 0.0, 0.0, 1e-7, 0.0, 0.0, 0.0, 0.0), pad_m=(0.01, 0.01),
-        position_status="valid", force_n=1.0, force_std_n=0.1, peak_force_n=1.0, force_status="valid",
-        total_current_a=1e-4, residual=1.0, residual_std=0.1, begin_threshold_n=0.1, end_threshold_n=0.05,
-        calibration_id="", end_reason="", retained=False,
+    return replace(
+        make_contact(link, "update", 1, hand=hand), t_ns=_SENTINEL, begin_ns=1, duration_s=1.0,
+        position_m=(0.01, 0.0, 0.01), normal=(0.0, 0.0, 1.0), pad_m=(0.01, 0.01), position_status="valid",
+        covariance_m2=(1e-7, 0.0, 0.0, 0.0, 1e-7, 0.0, 0.0, 0.0, 0.0), residual=1.0, residual_std=0.1,
     )  # fmt: skip
-
-
-def frame(hand: str) -> wire.HandFrame:
-    """Return a frame of a hand."""
-    columns: dict[str, Any] = {
-        name: bytes(len(LINKS) * column.row_bytes)
-        for name, column in wire.COLUMNS[wire.HandFrame].items()
-        if name.split("_")[0] not in ("group", "palm", "base", "joints")
-    }
-    return wire.HandFrame(
-        v=1, session=1, seq=1, t_ns=_SENTINEL, tick=1, hand=hand, links=LINKS, retained=False, **columns
-    )
 
 
 def service(hands: Sequence[str]) -> wire.Service:
@@ -86,7 +72,8 @@ def publish(endpoints: Sequence[str], touched: int, rate_hz: float, pipe: Connec
     messages = []
     for publisher, endpoint, hand in zip(publishers, endpoints, hands, strict=True):
         publisher.bind(endpoint)
-        encoded = [wire.encode(contact(hand, link)) for link in LINKS[:touched]] + [wire.encode(frame(hand))]
+        frame = make_frame(links=LINKS, hand=hand, t_ns=_SENTINEL)
+        encoded = [wire.encode(message) for message in (*(contact(hand, k) for k in LINKS[:touched]), frame)]
         messages.append([(topic, payload.partition(stamp)) for topic, payload in encoded])
     pipe.send("bound")
     while not pipe.poll():  # until the bridges have subscribed

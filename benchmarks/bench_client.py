@@ -17,12 +17,14 @@ from contextlib import contextmanager
 from typing import Any
 
 import msgpack
+import numpy as np
 import zmq
 
 import handtouch
 from benchmarks.page import Report, options
 from handtouch import wire
 from handtouch.client.hand import Hand
+from tests.client.hand_messages import make_frame
 
 LINKS = tuple(f"finger_{number}" for number in range(15))
 PERIOD_S, PAUSE_S = 0.005, 1.0
@@ -31,19 +33,10 @@ ARRIVAL_S = 0.001
 """From the arrival at one subscriber to that at the other"""
 
 
-def make_frame(seq: int) -> list[bytes]:
+def encoded_frame(seq: int) -> list[bytes]:
     """Return an encoded frame of 15 touched pads, stamped now."""
-    t_ns = time.monotonic_ns()
-    columns: dict[str, Any] = {}
-    for name, column in wire.COLUMNS[wire.HandFrame].items():
-        if name.split("_")[0] not in ("group", "palm", "base", "joints"):
-            columns[name] = bytes(len(LINKS) * column.row_bytes)
-    columns["state"] = bytes([wire.PadState.TOUCHED]) * len(LINKS)
-    return wire.encode(
-        wire.HandFrame(
-            v=1, session=1, seq=seq, t_ns=t_ns, tick=seq, hand="right", links=LINKS, retained=False, **columns
-        )
-    )
+    touched = np.full(len(LINKS), wire.PadState.TOUCHED)
+    return wire.encode(make_frame(seq, links=LINKS, t_ns=time.monotonic_ns(), state=touched))
 
 
 @contextmanager
@@ -109,7 +102,7 @@ def measure_cost(repeat: int) -> list[dict[str, Any]]:
             hand.latest()
             while bare.poll(0):
                 bare.recv_multipart()
-            socket.send_multipart(make_frame(next(sent)))
+            socket.send_multipart(encoded_frame(next(sent)))
             bare.poll(JOIN_MS)
             time.sleep(ARRIVAL_S)
 
@@ -140,7 +133,7 @@ def publishing(socket: Any) -> Iterator[None]:
         for seq in itertools.count(1):
             if stop.wait(PERIOD_S):
                 break
-            socket.send_multipart(make_frame(seq))
+            socket.send_multipart(encoded_frame(seq))
 
     thread = threading.Thread(target=publish)
     thread.start()

@@ -11,15 +11,22 @@ from handtouch import wire
 LINKS = ("thumb_tip", "index_tip", "index_base")
 
 
-def make_frame(seq: int = 1, *, session: int = 1, retained: bool = False, **values: Any) -> wire.HandFrame:
-    """Return a frame with the given columns, (3,) or (3, elements); the others are NaN or 0."""
+def make_frame(
+    seq: int = 1,
+    *,
+    session: int = 1,
+    retained: bool = False,
+    links: tuple[str, ...] = LINKS,
+    **values: Any,
+) -> wire.HandFrame:
+    """Return a frame of n links with the given columns, (n,) or (n, elements); the others are NaN or 0."""
     t_ns, hand = values.pop("t_ns", 10**9 + seq), values.pop("hand", "right")
     columns: dict[str, Any] = {}
     for name, column in wire.COLUMNS[wire.HandFrame].items():
         if name not in values and name.split("_")[0] in ("group", "palm", "base", "joints"):
             continue
         given = np.asarray(values.pop(name, np.nan if column.dtype == "<f4" else 0))
-        array = np.empty((len(LINKS), column.elements), column.dtype)
+        array = np.empty((len(links), column.elements), column.dtype)
         array[:] = given[:, None] if given.ndim == 1 and column.elements == 1 else given
         columns[name] = array.tobytes()
     assert not values, values
@@ -30,7 +37,7 @@ def make_frame(seq: int = 1, *, session: int = 1, retained: bool = False, **valu
         t_ns=t_ns,
         tick=seq,
         hand=hand,
-        links=LINKS,
+        links=links,
         retained=retained,
         **columns,
     )
