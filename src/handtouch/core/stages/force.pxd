@@ -32,9 +32,9 @@ cdef class ForceResult:
 @cython.locals(is_limited=bint)
 cdef void estimate_force(
     StackTable stack, PadLaw law, ForceResult result, double total_a, double total_std_a,
-    double log_spreading_m, double gradient2, double position_variance, double series_ohm) noexcept
+    double position_variance, double series_ohm) noexcept
 cdef void set_radius(ForceResult result, double log_radius) noexcept
-cdef double _find_end(StackTable stack, PadLaw law, double log_spreading_m, double resistors) noexcept
+cdef double _find_end(StackTable stack, PadLaw law, ForceResult result, double resistors) noexcept
 @cython.locals(_=Py_ssize_t)
 cdef double _find_likely(
     StackTable stack, PadLaw law, ForceResult result, double left, double least, double top) noexcept

@@ -174,12 +174,13 @@ class ForceResult:
     """Force of one contact [N]; `std_n` is infinite where `status` is LOWER_BOUND.
 
     The rest is working memory. Of the contact: `left`, stack factor and spreading that its current leaves;
-    `spreading` and `gradient2`: ln of the spreading radius, and square of its gradient; `high`, `low` and
-    `bend`, at one radius: limits of the spreading, the lower one less `bend` times the share of the current
-    that adapts to the edge; `by_radius`: derivative of their mean; `variance`, by noise, of the logarithm of
-    `left`. At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its logarithm is
-    above the expected one, `total`; `density` of the logarithm, over that of `sigma`; ln x^2 a standard
-    deviation, `step`; the stack `factor`, the `share` of the current that the sheet decides, and the
+    `spreading` and `gradient2`, set before: ln of the spreading radius [m], and square of its gradient
+    [1/m^2], at the contact's centre, where what `crowded_shift` found holds, or 0 without crowding; `high`,
+    `low` and `bend`, at one radius: limits of the spreading, the lower one less `bend` times the share of the
+    current that adapts to the edge; `by_radius`: derivative of their mean; `variance`, by noise, of the
+    logarithm of `left`. At one ln x^2: standard deviation `std` of `left`; `sigma`, by how many of them its
+    logarithm is above the expected one, `total`; `density` of the logarithm, over that of `sigma`; ln x^2 a
+    standard deviation, `step`; the stack `factor`, the `share` of the current that the sheet decides, and the
     deviation by the edge, `half_width`. `by_stack`: derivative of ln of the part's radius by that of the
     whole contact; `cut_std`: `cut_error` of a contact over an edge. `moved`, `cut`, `cut_by_radius`,
     `cut_error`, `bend_error`: see `crowded_shift`. `turning`, `turning_by_factor`, `around`, `square`,
@@ -204,17 +205,13 @@ def estimate_force(
     result: ForceResult,
     total_a: float,
     total_std_a: float,
-    log_spreading_m: float,
-    gradient2: float,
     position_variance: float,
     series_ohm: float,
 ) -> None:
-    """Estimate the force for a total current.
+    """Estimate the force for a total current, by the result's `spreading` and `gradient2`.
 
-    total_std_a: of noise and baseline. log_spreading_m: ln of the spreading radius; gradient2: square of its
-    gradient [1/m^2]: both at the contact's centre, where what `crowded_shift` found holds, or 0 without
-    crowding. position_variance: what the position's uncertainty, with that of the total, makes of the stack
-    factor's variance beyond noise of the total.
+    total_std_a: of noise and baseline. position_variance: what the position's uncertainty, with that of the
+    total, makes of the stack factor's variance beyond noise of the total.
     """
     result.force_n = result.std_n = _NAN
     result.status = _NOT_ESTIMATED
@@ -224,14 +221,13 @@ def estimate_force(
     noise = whole * total_std_a / total_a
     resistors = whole / law.parameters[0].drive_v * total_a * series_ohm
     result.left = max(whole - resistors, _MIN_LEFT)
-    result.spreading, result.gradient2 = log_spreading_m, gradient2
     result.variance = max(noise * noise + position_variance, 0.0) / (result.left * result.left)
     set_radius(result, law.parameters[0].log_radius)
     # beyond a share of the maximum current, forces hardly differ in current
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (result.high + resistors)
     top = law.parameters[0].max_log_x2
     if law.parameters[0].growth > 0.0:
-        end = _find_end(stack, law, log_spreading_m, resistors)
+        end = _find_end(stack, law, result, resistors)
         is_limited = top <= end
         top = min(top, end)
     else:
@@ -282,13 +278,13 @@ def set_radius(result: ForceResult, log_radius: float) -> None:
         result.low -= result.moved
 
 
-def _find_end(stack: StackTable, law: PadLaw, log_spreading_m: float, resistors: float) -> float:
+def _find_end(stack: StackTable, law: PadLaw, result: ForceResult, resistors: float) -> float:
     """Return ln x^2 from which on forces of a contact that grows hardly differ in current.
 
     It has reached an edge, and the resistance of its layer is a small share.
     """
     least = (1.0 / _MAX_CURRENT_FRACTION - 1.0) * (_MIN_LOG_SPREADING_RATIO + resistors)
-    room = log_spreading_m - _MIN_LOG_SPREADING_RATIO - law.parameters[0].log_radius
+    room = result.spreading - _MIN_LOG_SPREADING_RATIO - law.parameters[0].log_radius
     at_edge: float = law.parameters[0].log_x2 + room / law.parameters[0].growth
     return min(max(at_edge, find_log_x2(stack, least)), stack.first + stack.intervals / stack.per_width)
 

@@ -104,8 +104,7 @@ cdef void _find_centre(ContactSolver solver, Py_ssize_t pad, force.PadLaw law) n
 @cython.locals(fit=locate.Fit, law=force.PadLaw, surface=tables.PadSurface, whole=double, variance=double,
                curved=double)
 cdef void _find_spreading(ContactSolver solver, Py_ssize_t pad, double share) noexcept
-@cython.locals(n=Py_ssize_t, fit=locate.Fit, law=force.PadLaw,
-               log_spreading_m=double)
+@cython.locals(n=Py_ssize_t, fit=locate.Fit, law=force.PadLaw)
 cdef void _estimate_force(ContactSolver solver, Py_ssize_t pad, double share) noexcept
 @cython.locals(chance=double)
 cdef void _span_two_patches(ContactSolver solver, Py_ssize_t pad) noexcept

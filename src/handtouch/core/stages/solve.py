@@ -246,6 +246,9 @@ def _estimate_both(solver: ContactSolver, pad: int, last_radius_m: float, satura
     if both.numbers[pad] < 0:
         return
     _find_spreading(solver, pad, 1.0)
+    both.spreading, both.pure, both.mixed = solver.log_spreading_m, solver.pure, solver.mixed
+    # over an edge, the radius decides how far
+    both.gradient2 = 0.0 if solver.result.cut < 0.0 else solver.gradient2
     two_sheets.estimate_both(
         both,
         pad,
@@ -253,10 +256,6 @@ def _estimate_both(solver: ContactSolver, pad: int, last_radius_m: float, satura
         solver.result,
         0.0 if saturated else fit.total,
         math.sqrt(fit.var_total),
-        solver.log_spreading_m,
-        0.0 if solver.result.cut < 0.0 else solver.gradient2,  # over an edge, the radius decides how far
-        solver.pure,
-        solver.mixed,
         force.series_resistance(law, solver.currents, pad * solver.electrodes, n),
         last_radius_m,
     )
@@ -473,6 +472,7 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> N
     if solver.crowding[pad]:
         gradient2 = (slope_x * slope_x + slope_y * slope_y) / (scale_m * scale_m)
     solver.result.moved = solver.result.cut = 0.0  # R is that at the centre of the current
+    solver.result.spreading, solver.result.gradient2 = pair.spreading[k] + math.log(scale_m), gradient2
     for step in range(2):
         force.estimate_force(
             solver.stack,
@@ -480,8 +480,6 @@ def _estimate_part_force(solver: ContactSolver, pad: int, k: int, row: int) -> N
             solver.result,
             total,
             math.sqrt(pair.var_total[k]),
-            pair.spreading[k] + math.log(scale_m),
-            gradient2,
             variance,
             resistors + step * mutual,
         )
@@ -722,19 +720,17 @@ def _estimate_force(solver: ContactSolver, pad: int, share: float) -> None:
     fit = solver.fit
     n, law = fit.whitening.electrodes, solver.laws[pad]
     _find_spreading(solver, pad, share)
-    log_spreading_m = solver.log_spreading_m
+    solver.result.spreading, solver.result.gradient2 = solver.log_spreading_m, solver.gradient2
     if solver.gradient2 > 0.0 and solver.result.cut < 0.0:
         force.set_part(solver.part_law, law, solver.result.cut)
         law = solver.part_law
-        log_spreading_m += _CUT_MORE * solver.result.cut
+        solver.result.spreading += _CUT_MORE * solver.result.cut
     force.estimate_force(
         solver.stack,
         law,
         solver.result,
         share * fit.total,
         share * math.sqrt(fit.var_total),
-        log_spreading_m,
-        solver.gradient2,
         solver.pure + 2.0 * solver.mixed,
         force.series_resistance(law, solver.currents, pad * solver.electrodes, n) / share,
     )

@@ -25,7 +25,7 @@ cdef class TwoSheets:
     cdef force.ForceResult result
     cdef force.PadLaw near, second_near
     cdef bint is_used, contradicts
-    cdef double radius_m, radius_std_m, spreading, gradient2, shared, uneven, squared, score, curvature
+    cdef double radius_m, radius_std_m, spreading, gradient2, pure, mixed, shared, uneven, squared, score, curvature
     cdef double log_load, load_variance, log_weight, growth, middle, width2, cell
     cdef double off, by_radius, variance, aside, by_aside
     cdef loads.SheetInterval first_step, second_step
@@ -39,8 +39,7 @@ cpdef read_totals(TwoSheets both, SampleMemory memory)
                width=double, middle=double)
 cdef void estimate_both(
     TwoSheets both, Py_ssize_t pad, force.PadLaw law, force.ForceResult result,
-    double total_a, double total_std_a, double log_spreading_m, double gradient2, double pure, double mixed,
-    double series_ohm, double start_m) noexcept
+    double total_a, double total_std_a, double series_ohm, double start_m) noexcept
 @cython.locals(whole=double, noise=double, resistors=double, left=double,
                power=double, before=double)
 cdef void _set_sheet(

@@ -141,7 +141,7 @@ class TwoSheets:
         self.second_step: loads.SheetInterval | None = None
         self.is_used = self.contradicts = False
         self.radius_m = self.radius_std_m = _NAN
-        self.spreading = self.gradient2 = self.shared = self.uneven = 0.0
+        self.spreading = self.gradient2 = self.pure = self.mixed = self.shared = self.uneven = 0.0
         self.squared = self.score = self.curvature = 0.0
         self.off = self.by_radius = self.variance = self.aside = self.by_aside = 0.0
         self.log_load = self.load_variance = self.log_weight = self.growth = 0.0
@@ -181,19 +181,16 @@ def estimate_both(
     result: force.ForceResult,
     total_a: float,
     total_std_a: float,
-    log_spreading_m: float,
-    gradient2: float,
-    pure: float,
-    mixed: float,
     series_ohm: float,
     start_m: float,
 ) -> None:
     """Estimate force and radius by both sheets; `is_used` is False where the second says nothing.
 
-    total_a, total_std_a, series_ohm: of the first sheet's current. pure, mixed: variance of ln of the
-    spreading radius by the position, and its covariance with the first sheet's stack factor by the total.
-    start_m: radius to begin the search at, NaN for the middle of those expected. The result has the first
-    sheet's apparent force at the radius found."""
+    Set before: `spreading`, ln of the spreading radius; `gradient2`, square of its gradient; `pure`, `mixed`,
+    variance of the former by the position, and its covariance with the first sheet's stack factor by the
+    total. total_a, total_std_a, series_ohm: of the first sheet's current. start_m: radius to begin the search
+    at, NaN for the middle of those expected. The result has the first sheet's apparent force at the radius
+    found."""
     k = both.numbers[pad]
     both.pad, both.number, both.result = pad, k, result
     both.is_used = both.contradicts = False
@@ -208,9 +205,9 @@ def estimate_both(
         return
     if not total_a > _BOUND_SIGMA * total_std_a:
         return
-    both.spreading, both.gradient2, both.shared = log_spreading_m, gradient2, pure + mixed
-    _set_sheet(both, 0, law, both.near, total_a, total_std_a, series_ohm, pure + 2.0 * mixed)
-    _set_sheet(both, 1, both.laws[k], both.second_near, second_a, noise_a, 0.0, pure)
+    both.shared = both.pure + both.mixed
+    _set_sheet(both, 0, law, both.near, total_a, total_std_a, series_ohm, both.pure + 2.0 * both.mixed)
+    _set_sheet(both, 1, both.laws[k], both.second_near, second_a, noise_a, 0.0, both.pure)
     both.first_step, both.second_step = loads.find_step(both.first, pad), loads.find_step(both.second, k)
     both.uneven = law.parameters[0].uneven
     both.growth = _THIRD if law.parameters[0].growth > 0.0 else 0.0
