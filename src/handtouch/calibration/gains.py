@@ -225,12 +225,6 @@ class GainEstimator:
             self._process_batch(batch[:c], batch[c:])
         return int(useful.shape[1])
 
-    def process_pending(self) -> None:
-        """Process the contacts of an incomplete batch, as at the end of a recording."""
-        if self._pending:
-            batch, self._pending = np.array(self._pending).T, []
-            self._process_batch(batch[: self._channels], batch[self._channels :])
-
     @property
     def estimate(self) -> GainEstimate:
         """Return the estimate after the batches so far."""
