@@ -44,6 +44,7 @@ from benchmarks.hand_touches import (
     SAMPLE_S,
     STEP_S,
     TOUCH_S,
+    Key,
     TouchReadings,
     draw_touches,
     estimates,
@@ -182,19 +183,30 @@ def play(world: str, number: int, touches: int) -> Played:
     stimulus = Scenario(touch=draw_touches(model.links, numbers.stop, drawn.seed))
     readings = TouchReadings.of_hand(VirtualHand(deployment, stimulus, drawn), deployment, numbers)
     contacts = readings.contacts(model, stated)
+    pairs = [bool(contact.parts) for (_, link), contact in contacts.items() if link == PAIRED]
+    return Played(estimates_of_finger(model, contacts, readings.truths, number, "electrodes"), pairs)
+
+
+def estimates_of_finger(
+    model: PadModel,
+    contacts: Mapping[Key, wire.Contact],
+    truths: Mapping[Key, GroundTruth],
+    number: int,
+    channels: str,
+) -> dict[str, Estimates]:
+    """Return estimates of position and force of a finger's touches, by pad with its number of `channels`."""
     parts: dict[str, list[Estimates]] = {quantity: [] for quantity in ERRORS}
     for row, link in enumerate(model.links):
-        found = [(contacts.get(key), truth) for key, truth in readings.truths.items() if key[1] == link]
+        found = [(contacts.get(key), truth) for key, truth in truths.items() if key[1] == link]
         true_n = np.array([truth.force_n for _, truth in found])
         columns = {
-            "pad": np.full(len(found), f"{link}, {model.electrode_counts[row]} electrodes"),
+            "pad": np.full(len(found), f"{link}, {model.electrode_counts[row]} {channels}"),
             "force": bin_labels(true_n, (0.5, 2.0, 5.0), "N"),
             "finger": np.full(len(found), number),
         }
         for quantity, own in estimates_without_oracle(found, columns).items():
             parts[quantity].append(own)
-    pairs = [bool(contact.parts) for (_, link), contact in contacts.items() if link == PAIRED]
-    return Played({quantity: concatenate(some) for quantity, some in parts.items()}, pairs)
+    return {quantity: concatenate(some) for quantity, some in parts.items()}
 
 
 def play_pairs(world: str, finger: int, count: int) -> list[PlayedPair]:

@@ -38,7 +38,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from benchmarks.bench_electrodes import ERRORS, estimates_without_oracle, share_of
+from benchmarks.bench_electrodes import ERRORS, estimates_of_finger, share_of
 from benchmarks.bench_worlds import UNITS
 from benchmarks.hand_touches import (
     FORCES_N,
@@ -81,17 +81,7 @@ def play(deployment: Deployment, world: str, number: int, touches: int) -> dict[
     model, numbers = PadModel(stated), range(FIRST, FIRST + touches)
     stimulus = Scenario(touch=draw_touches(model.links, numbers.stop, drawn.seed))
     readings = TouchReadings.of_hand(VirtualHand(stated, stimulus, drawn), stated, numbers)
-    contacts = readings.contacts(model, stated)
-    parts: dict[str, list[Estimates]] = {quantity: [] for quantity in ERRORS}
-    for row, link in enumerate(model.links):
-        found = [(contacts.get(key), truth) for key, truth in readings.truths.items() if key[1] == link]
-        columns = {
-            "pad": np.full(len(found), f"{link}, {model.electrode_counts[row]} channels"),
-            "finger": np.full(len(found), number),
-        }
-        for quantity, own in estimates_without_oracle(found, columns).items():
-            parts[quantity].append(own)
-    return {quantity: concatenate(some) for quantity, some in parts.items()}
+    return estimates_of_finger(model, readings.contacts(model, stated), readings.truths, number, "channels")
 
 
 def play_measured(world: World, number: int, touches: int) -> dict[str, Estimates]:

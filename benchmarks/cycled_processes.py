@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.client_checks import Truth, longest_age_s, watch_hand, watch_ros
 from benchmarks.compressed_days import Act
 from benchmarks.page import ROOT, progress
-from benchmarks.served_hand import descriptors, in_own_network, on_loopback, resident_mb
+from benchmarks.served_hand import descriptors, on_loopback, resident_mb
 from handtouch.client import connect, request
 from handtouch.config import load
 
@@ -40,7 +40,6 @@ TRANSIENT_S = 60.0
 """A trouble explains warnings up to this time after it, on such a machine."""
 HOST_PAUSES = re.compile("the loop was late|late ticks by longest part|was paused")
 """Messages about other load of the machine."""
-__all__ = ["in_own_network", "run_cycles"]
 
 
 class Processes:

@@ -36,8 +36,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small
 
 
 from benchmarks.compressed_days import AFTERWARDS_S, FULL_DISK_S, Days, is_work, run_days
-from benchmarks.cycled_processes import growth, in_own_network, run_cycles, unexplained
+from benchmarks.cycled_processes import growth, run_cycles, unexplained
 from benchmarks.scores import Share
+from benchmarks.served_hand import in_own_network
 from handtouch.record.recording import Recording
 from handtouch.record.replay_recording import replay_recording
 
