@@ -33,6 +33,7 @@ from benchmarks.served_hand import descriptors, resident_mb
 from benchmarks.soak_alarms import BLOCK_S, BUSY_HZ, Hour
 from handtouch import wire
 from handtouch.calibration.store_client import StoreClient
+from handtouch.canbus.nodes.lifecycle_types import NodeState
 from handtouch.canbus.nodes.spec import SerialChanged
 from handtouch.config import Deployment
 from handtouch.config.files import deployment_files
@@ -295,7 +296,7 @@ class Session:
         self.pipeline.node_state[:] = PadState.CLEAR
         self.process = InlineSupervisor(start_message(deployment, store))
         self.serials: list[int | None] = [None] * model.size
-        nodes: Any = SimpleNamespace(status=lambda: [SimpleNamespace(serial=s) for s in self.serials])
+        nodes: Any = SimpleNamespace(status=self._node_status)
         self.supervisor = SupervisorClient(deployment, self.pipeline, nodes, "", self.process)
         self.percepts = PerceptPublisher(
             deployment, self.pipeline, recording, number, process=InlineProcess(deployment)
@@ -311,6 +312,9 @@ class Session:
         self.send_service(now_ns)
         files = deployment_files(deployment)
         self.pipeline.journal.publish_config(deployment, files, build_info(), now_ns)
+
+    def _node_status(self) -> list[SimpleNamespace]:
+        return [SimpleNamespace(serial=serial, state=NodeState.OPERATIONAL) for serial in self.serials]
 
     def assign_nodes(self, serials: list[int], now_ns: int) -> None:
         """Report the nodes as the master does."""
