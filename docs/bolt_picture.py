@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from handtouch.simulate.tactile.bolt_scene import HOLE_M, BoltStart
+from handtouch.simulate.tactile.bolt_scene import HOLE_M, Bolt, BoltStart
 from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose, Sensed
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "examples"))
-import bolt_pose  # noqa: E402
-import start_bolt  # noqa: E402
-from bolt_pose import HALF_M, Contact, InGrip, OnTable, compose  # noqa: E402
+from bolt_pose import Contact, InGrip, KnownBolt, OnTable, compose  # noqa: E402
 from start_bolt import BoltStarter, Step  # noqa: E402
 
 FloatArray = NDArray[np.float64]
@@ -50,37 +48,36 @@ _STILLS = {
 class Estimate:
     """Both ends of the bolt (2, 3) in a frame, and their covariances (2, 3, 3), as a fit leaves them."""
 
-    def __init__(self, x: FloatArray, covariance: FloatArray, pose_of: Callable[[FloatArray], Pose]) -> None:
-        self.points_m = _ends(pose_of(x))
+    def __init__(
+        self, x: FloatArray, covariance: FloatArray, ends_of: Callable[[FloatArray], FloatArray]
+    ) -> None:
+        self.points_m = ends_of(x)
         step = 1e-4
-        slopes = np.stack([(_ends(pose_of(x + step * e)) - self.points_m) / step for e in np.eye(len(x))])
+        slopes = np.stack([(ends_of(x + step * e) - self.points_m) / step for e in np.eye(len(x))])
         self.covariances_m2 = np.einsum("aej,ab,bek->ejk", slopes, covariance, slopes)
 
 
-def _ends(pose: Pose) -> FloatArray:
-    return pose[0] + np.outer([-HALF_M, HALF_M], pose[1][:, 2])
+class WatchedBolt(KnownBolt):
+    """What was found last: contacts and estimate in the world, or an estimate in the grip."""
 
-
-class Watched:
-    """What the program found last: contacts and estimate in the world, or an estimate in the grip."""
-
-    def __init__(self) -> None:
+    def __init__(self, bolt: Bolt) -> None:
+        super().__init__(bolt)
         self.contacts: list[Contact] = []
         self.on_table: Estimate | None = None
         self.in_grip: Estimate | None = None
-        start_bolt.poses_on_table, start_bolt.pose_in_grip = self.poses_on_table, self.pose_in_grip
 
     def poses_on_table(self, contacts: list[Contact], spheres: FloatArray) -> list[OnTable]:
         """Do as the program's."""
-        found = bolt_pose.poses_on_table(contacts, spheres)
+        found = super().poses_on_table(contacts, spheres)
         self.contacts, self.in_grip = list(contacts), None
-        self.on_table = Estimate(found[0].parameters, found[0].covariance, lambda x: bolt_pose.lying(*x))
+        self.on_table = Estimate(found[0].parameters, found[0].covariance, lambda x: self.ends(self.lying(x)))
         return found
 
     def pose_in_grip(self, expected: Pose, contacts: list[Contact]) -> InGrip:
         """Do as the program's."""
-        found = bolt_pose.pose_in_grip(expected, contacts)
-        self.contacts, self.in_grip = [], Estimate(found.change, found.covariance, found.at)
+        found = super().pose_in_grip(expected, contacts)
+        self.contacts = []
+        self.in_grip = Estimate(found.change, found.covariance, lambda x: self.ends(found.at(x)))
         return found
 
 
@@ -105,7 +102,7 @@ class FilmedCell(BoltWorkcell):
         self._target_m = np.array([0.0, 0.0, 0.05])
         self.frames: list[Image.Image] = []
         self._periods, self._step = 0, Step.SEARCH
-        self.watched = Watched()
+        self.watched = WatchedBolt(self.scene.bolt)
         self.program: BoltStarter | None = None
 
     def move(self, flange: Pose, joint_rad: np.ndarray[Any, Any]) -> Sensed:
@@ -194,6 +191,7 @@ def main() -> None:
     cell = FilmedCell(seed, BoltStart.drawn(seed))
     cell.film()
     cell.program = program = BoltStarter(cell, log=print)
+    program.bolt = cell.watched
     program.run()
     cell.take_still(program._sensed)
     first, *others = cell.frames + cell.frames[-1:] * 10

@@ -1,7 +1,7 @@
 """Fit the pose of a bolt to the places where it was touched and to those where it isn't.
 
-Public names: `Contact`, `OnTable`, `poses_on_table`, `lying`, `touched_m`, `InGrip`, `pose_in_grip`; poses in
-frames: `compose`, `inverse`, `relative`.
+Public names: `KnownBolt`, a bolt whose shape is known; `Contact`; `OnTable` and `InGrip`, poses that fit;
+poses in frames: `compose`, `inverse`, `relative`.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from handtouch.config.objects import BoltShape, ObjectTable
 from handtouch.percept.object_shapes import build_shape
+from handtouch.simulate.tactile.bolt_scene import Bolt
 from handtouch.simulate.tactile.bolt_workcell import Pose
 
 FloatArray = NDArray[np.float64]
 
-_SHAPE = BoltShape(kind="bolt", diameter_mm=10, length_mm=40, head_diameter_mm=17, head_length_mm=6.4)
-BOLT = build_shape(ObjectTable(shape=_SHAPE))
-HALF_M = float(BOLT.half_m[2])
-SHANK_M, HEAD_M, HEAD_LENGTH_M = 5e-3, 8.5e-3, 6.4e-3
-"""Radii of shank and head, as they touch the table: a hexagon is between 8 and 9.2 mm"""
 AREA_M = 0.02
 """The bolt lies within so much of the middle"""
 UP = np.array([0.0, 0.0, 1.0])
+_ROUND_HEAD = 17 / 16
+"""Diameter of a round head that is like a hexagon, over its width across flats: from corner to corner 1.15"""
 _GRIPPED_STD_M, _GRIPPED_STD_RAD = 2.5e-3, np.array([0.04, 0.1, 0.12])
 """Of the bolt in the grip, as it was found on the table: closing fingers turn it about the approach most"""
-_TRACED = 24
-"""Steps of predicting a touch"""
+_SAME_DIRECTION, _MIN_WEIGHT = np.cos(np.radians(20.0)), 0.01
+"""Fits within this cosine are one pose, and poses less likely than this are left out"""
+_LOWERED = 24
+"""Steps of lowering spheres in thought"""
 
 
 class Contact(NamedTuple):
@@ -51,35 +51,15 @@ class Contact(NamedTuple):
         return self._replace(point_m=(self.point_m - position) @ rotation, normal=self.normal @ rotation)
 
 
-def contact_residuals(pose: Pose, contacts: list[Contact], std_m: float, std_rad: float) -> FloatArray:
-    """Return how contacts (c,) deviate from a bolt's surface, in standard deviations (4 c,).
-
-    Normals are compared 3 mm outside, where the gradient at an edge is any normal that a pad there may have.
-    """
-    position, rotation = pose
-    points = (np.array([each.point_m for each in contacts]) - position) @ rotation
-    normals = np.array([each.normal for each in contacts]) @ rotation
-    distance = BOLT.distance(points)
-    _, outward = BOLT.distance_and_normal(points - 3e-3 * normals)
-    spread = np.hypot([each.std_m for each in contacts], std_m)
-    turned = np.hypot([each.std_rad for each in contacts], std_rad)
-    return np.concatenate([distance / spread, ((outward + normals) / turned[:, None]).ravel()])
-
-
 class OnTable(NamedTuple):
     """A possible pose of a bolt on the table."""
 
     parameters: FloatArray
-    """(3,) of `lying`"""
+    """(3,) of `KnownBolt.lying`"""
     weight: float
-    """against the likeliest pose with the other end"""
+    """among the possible poses"""
     covariance: FloatArray
     """(3, 3) of the parameters"""
-
-    @property
-    def pose(self) -> Pose:
-        """In the world."""
-        return lying(*self.parameters)
 
     @property
     def direction_std_rad(self) -> float:
@@ -90,76 +70,6 @@ class OnTable(NamedTuple):
         """Return points with weights that have its mean and covariance."""
         root = np.sqrt(3) * np.linalg.cholesky(self.covariance + 1e-12 * np.eye(3)).T
         return [(self.parameters + each, self.weight / 6) for each in (*root, *-root)]
-
-
-def poses_on_table(contacts: list[Contact], spheres: FloatArray) -> list[OnTable]:
-    """Return possible poses of a bolt on the table, outside of spheres (n, 4); the likeliest is the first.
-
-    The second is the likeliest with the other end, if there is one.
-    """
-    middle = np.mean([each.point_m[:2] for each in contacts], axis=0)
-    reach = np.arange(-0.024, 0.0241, 0.004)
-    best: list[tuple[float, FloatArray]] = []
-    for yaw in np.radians(np.arange(0, 360, 10)):
-        along = np.array([np.cos(yaw), np.sin(yaw)])
-        across = np.array([-along[1], along[0]])
-        starts = [(middle + a * along + b * across, yaw) for a in reach for b in (-0.005, 0.0, 0.005)]
-        costs = [np.square(_on_table(np.array([*at, yaw]), contacts, spheres)).sum() for at, yaw in starts]
-        k = int(np.argmin(costs))
-        best.append((float(costs[k]), np.array([*starts[k][0], yaw])))
-    best.sort(key=lambda each: each[0])
-    fits = [
-        least_squares(_on_table, start, args=(contacts, spheres), x_scale=[1e-3, 1e-3, 0.1])
-        for _, start in best[:8]
-    ]
-    fits.sort(key=lambda fit: fit.cost)
-    turned = [fit for fit in fits if np.cos(fit.x[2] - fits[0].x[2]) < 0]
-    ends = [fits[0], *turned[:1]]
-    sure = weight_of(fits[0].cost, turned[0].cost if turned else np.inf)
-    of = zip(ends, (sure, 1 - sure), strict=False)
-    return [OnTable(fit.x, weight, _covariance(np.asarray(fit.jac))) for fit, weight in of]
-
-
-def _covariance(jacobian: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.pinv(jacobian.T @ jacobian))
-
-
-def touched_m(pose: Pose, spheres: FloatArray, lowest_m: float) -> FloatArray:
-    """Return the point (3,) of a bolt that spheres (n, 4) touch first when lowered; if none, one below.
-
-    The spheres are lowered by their least distance, again and again, as a ray is traced, at most to a height
-    `lowest_m` above that of which they are given.
-    """
-    position, rotation = pose
-    way_m = 0.05
-    for _ in range(_TRACED):
-        centres = spheres[:, :3] + [0.0, 0.0, way_m]
-        apart = BOLT.distance((centres - position) @ rotation) - spheres[:, 3]
-        k = int(np.argmin(apart))
-        if apart[k] < 0.2e-3:
-            _, outward = BOLT.distance_and_normal((centres[k : k + 1] - position) @ rotation)
-            return np.asarray(centres[k] - spheres[k, 3] * (rotation @ outward[0]))
-        way_m -= apart[k]
-        if way_m < lowest_m:
-            break
-    return np.array([*spheres[:, :2].mean(axis=0), -0.01])
-
-
-def _on_table(parameters: FloatArray, contacts: list[Contact], spheres: FloatArray) -> FloatArray:
-    position, rotation = pose = lying(*parameters)
-    apart_m = BOLT.distance((spheres[:, :3] - position) @ rotation) - spheres[:, 3]
-    apart, beyond = (apart_m + 0.7e-3) / 1e-3, (np.abs(parameters[:2]) - AREA_M) / 5e-3
-    touched = contact_residuals(pose, contacts, 0.7e-3, 0.2)
-    return np.concatenate([touched, np.minimum(apart, 0.0), np.maximum(beyond, 0.0)])
-
-
-def lying(x: float, y: float, yaw: float) -> Pose:
-    """Return the pose of a bolt on the table, on its head's edge and its tip."""
-    slope = (HEAD_M - 0.5e-3 - SHANK_M) / (2 * HALF_M - HEAD_LENGTH_M)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], UP])
-    upright = np.array([[0.0, -slope, 1.0], [-np.hypot(1.0, slope), 0.0, 0.0], [0.0, -1.0, -slope]])
-    place = np.array([x, y, SHANK_M + slope * HALF_M])
-    return place, turn @ upright / np.hypot(1.0, slope)
 
 
 class InGrip(NamedTuple):
@@ -183,28 +93,132 @@ class InGrip(NamedTuple):
         return _shifted(change, self.expected)
 
 
-def pose_in_grip(expected: Pose, contacts: list[Contact]) -> InGrip:
-    """Return the bolt's pose by contacts, near the expected."""
-    turned = expected[0], expected[1] @ np.diag([1.0, -1.0, -1.0])
-    fits = [least_squares(_in_grip, np.zeros(6), args=(pose, contacts)) for pose in (expected, turned)]
-    weight = weight_of(fits[0].cost, fits[1].cost)
-    return InGrip(expected, fits[0].x, _covariance(np.asarray(fits[0].jac)), weight)
+class KnownBolt:
+    """A bolt whose shape is known, at a pose that isn't.
+
+    Attributes in m: `half_m` of its length, `shank_m` and `flats_m`, the least radii of shank and head, and
+    `head_m`, the head's length.
+    """
+
+    def __init__(self, bolt: Bolt) -> None:
+        self.half_m, self.head_m = bolt.total_m / 2, bolt.head_m
+        self.shank_m, self.flats_m = bolt.diameter_m / 2, bolt.head_flats_m / 2
+        shape = BoltShape(
+            kind="bolt",
+            diameter_mm=1e3 * bolt.diameter_m,
+            length_mm=1e3 * bolt.length_m,
+            head_diameter_mm=1e3 * _ROUND_HEAD * bolt.head_flats_m,
+            head_length_mm=1e3 * bolt.head_m,
+        )
+        self._shape = build_shape(ObjectTable(shape=shape))
+
+    def ends(self, pose: Pose) -> FloatArray:
+        """Return the middles (2, 3) of head and tip."""
+        return pose[0] + np.outer([-self.half_m, self.half_m], pose[1][:, 2])
+
+    def lying(self, parameters: FloatArray) -> Pose:
+        """Return the pose of a bolt on the table, on its head's edge and its tip; parameters: x, y, yaw."""
+        x, y, yaw = parameters
+        slope = (self.flats_m - self.shank_m) / (2 * self.half_m - self.head_m)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], UP])
+        upright = np.array([[0.0, -slope, 1.0], [-np.hypot(1.0, slope), 0.0, 0.0], [0.0, -1.0, -slope]])
+        place = np.array([x, y, self.shank_m + slope * self.half_m])
+        return place, turn @ upright / np.hypot(1.0, slope)
+
+    def poses_on_table(self, contacts: list[Contact], spheres: FloatArray) -> list[OnTable]:
+        """Return possible poses of a bolt on the table, outside of spheres (n, 4), the likeliest first.
+
+        Fits that point the same way are one.
+        """
+        middle = np.mean([each.point_m[:2] for each in contacts], axis=0)
+        reach = np.arange(-0.024, 0.0241, 0.004)
+        best: list[tuple[float, FloatArray]] = []
+        for yaw in np.radians(np.arange(0, 360, 10)):
+            along = np.array([np.cos(yaw), np.sin(yaw)])
+            across = np.array([-along[1], along[0]])
+            at = [middle + a * along + b * across for a in reach for b in (-0.005, 0.0, 0.005)]
+            starts = [np.array([*each, yaw]) for each in at]
+            costs = [np.square(self._on_table(start, contacts, spheres)).sum() for start in starts]
+            k = int(np.argmin(costs))
+            best.append((float(costs[k]), starts[k]))
+        best.sort(key=lambda each: each[0])
+        fits = [
+            least_squares(self._on_table, start, args=(contacts, spheres), x_scale=[1e-3, 1e-3, 0.1])
+            for _, start in best[:8]
+        ]
+        fits.sort(key=lambda fit: fit.cost)
+        apart = fits[:1]
+        for fit in fits[1:]:
+            if all(np.cos(fit.x[2] - other.x[2]) < _SAME_DIRECTION for other in apart):
+                apart.append(fit)
+        weights = _weights(np.array([fit.cost for fit in apart]))
+        found = zip(apart, weights.tolist(), strict=True)
+        return [OnTable(fit.x, own, _covariance(fit.jac)) for fit, own in found if own > _MIN_WEIGHT]
+
+    def lowered_m(self, parameters: FloatArray, spheres: FloatArray, lowest_m: float) -> float:
+        """Return how far above their given height spheres (n, 4) touch a lying bolt, `lowest_m` for never.
+
+        The spheres are lowered by their least distance, again and again, as a ray is traced.
+        """
+        position, rotation = self.lying(parameters)
+        above_m = 0.05
+        for _ in range(_LOWERED):
+            centres = spheres[:, :3] + [0.0, 0.0, above_m]
+            apart_m = float((self._shape.distance((centres - position) @ rotation) - spheres[:, 3]).min())
+            if apart_m < 0.2e-3 or above_m - apart_m < lowest_m:
+                return above_m if apart_m < 0.2e-3 else lowest_m
+            above_m -= apart_m
+        return above_m
+
+    def pose_in_grip(self, expected: Pose, contacts: list[Contact]) -> InGrip:
+        """Return the bolt's pose by contacts, near the expected."""
+        turned = expected[0], expected[1] @ np.diag([1.0, -1.0, -1.0])
+        fits = [
+            least_squares(self._in_grip, np.zeros(6), args=(pose, contacts)) for pose in (expected, turned)
+        ]
+        weights = _weights(np.array([fit.cost for fit in fits]))
+        return InGrip(expected, fits[0].x, _covariance(fits[0].jac), float(weights[0]))
+
+    def _on_table(self, parameters: FloatArray, contacts: list[Contact], spheres: FloatArray) -> FloatArray:
+        position, rotation = pose = self.lying(parameters)
+        apart_m = self._shape.distance((spheres[:, :3] - position) @ rotation) - spheres[:, 3]
+        apart, beyond = (apart_m + 0.7e-3) / 1e-3, (np.abs(parameters[:2]) - AREA_M) / 5e-3
+        touched = self._touched(pose, contacts, 0.7e-3)
+        return np.concatenate([touched, np.minimum(apart, 0.0), np.maximum(beyond, 0.0)])
+
+    def _in_grip(self, change: FloatArray, expected: Pose, contacts: list[Contact]) -> FloatArray:
+        return np.concatenate([self._touched(_shifted(change, expected), contacts, 0.4e-3), change])
+
+    def _touched(self, pose: Pose, contacts: list[Contact], std_m: float, std_rad: float = 0.2) -> FloatArray:
+        """Return how contacts (c,) deviate from the bolt's surface, in standard deviations (4 c,).
+
+        Normals are compared 3 mm outside, where the gradient at an edge is any normal that a pad there may
+        have.
+        """
+        position, rotation = pose
+        points = (np.array([each.point_m for each in contacts]) - position) @ rotation
+        normals = np.array([each.normal for each in contacts]) @ rotation
+        distance = self._shape.distance(points)
+        _, outward = self._shape.distance_and_normal(points - 3e-3 * normals)
+        spread = np.hypot([each.std_m for each in contacts], std_m)
+        turned = np.hypot([each.std_rad for each in contacts], std_rad)
+        return np.concatenate([distance / spread, ((outward + normals) / turned[:, None]).ravel()])
 
 
-def _in_grip(change: FloatArray, expected: Pose, contacts: list[Contact]) -> FloatArray:
-    pose = _shifted(change, expected)
-    return np.concatenate([contact_residuals(pose, contacts, 0.4e-3, 0.2), change])
+def _covariance(jacobian: object) -> FloatArray:
+    return np.asarray(np.linalg.pinv(np.asarray(jacobian).T @ np.asarray(jacobian)))
+
+
+def _weights(costs: FloatArray) -> FloatArray:
+    """Return the weights (n,) of poses by half of their squared residuals (n,)."""
+    likelihood = np.exp(costs.min() - costs)
+    return np.asarray(likelihood / likelihood.sum())
 
 
 def _shifted(change: FloatArray, pose: Pose) -> Pose:
     """Return a pose after a change (6,), in standard deviations of what is expected."""
     turn = Rotation.from_rotvec(_GRIPPED_STD_RAD * change[3:]).as_matrix()
     return pose[0] + _GRIPPED_STD_M * change[:3], turn @ pose[1]
-
-
-def weight_of(cost: float, other: float) -> float:
-    """Return the weight of a hypothesis against another, by half of their squared residuals."""
-    return float(1 / (1 + np.exp(np.clip(cost - other, -50, 50))))
 
 
 def compose(first: Pose, second: Pose) -> Pose:

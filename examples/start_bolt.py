@@ -3,11 +3,12 @@
 A state machine. It knows the bolt's shape, that it lies within 40 x 40 mm of the table, where the hole is,
 and the hand's URDF; it gets reported joint positions and the columns of touch that a `Hand` and a
 `TactileReading` share. There is no camera. SEARCH lowers flat fingers from several sides: each contact is a
-point of the bolt's surface, with the normal of the pad there, and where the fingers are, it isn't. GRASP
-closes thumb, index and middle finger around the shank with stated forces. LIFT notices when it failed. FEEL
-fits the bolt's pose to the contacts of the fingers, weighted by their covariances. ORIENT points the free end
-to the hole. INSERT pushes, follows a spiral over the rim while the fingers yield, and pushes on when the tip
-falls in.
+point of the bolt's surface, with the normal of the pad there, and where the fingers are, it isn't; it asks
+for the touch of the most expected information. GRASP closes thumb, index and middle finger around the shank
+with stated forces. LIFT notices when it failed, or when the bolt slips, and puts it down. FEEL fits the
+bolt's pose to the contacts of the fingers, weighted by their covariances. ORIENT points the free end to the
+hole. INSERT pushes, follows a spiral over the rim while the fingers yield, and pushes on when the tip falls
+in.
 
 Needs the extra `gym`. Public names: `BoltStarter`, `Step`.
 """
@@ -15,31 +16,22 @@ Needs the extra `gym`. Public names: `BoltStarter`, `Step`.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import itertools
+import signal
+import sys
 from collections.abc import Callable
 from enum import Enum
 
 import numpy as np
 import pinocchio as pin
-from bolt_pose import (
-    HALF_M,
-    SHANK_M,
-    UP,
-    Contact,
-    OnTable,
-    compose,
-    inverse,
-    lying,
-    pose_in_grip,
-    poses_on_table,
-    relative,
-    touched_m,
-)
+from bolt_pose import UP, Contact, KnownBolt, OnTable, compose, inverse, relative
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, Slerp
 
-from handtouch.simulate.tactile.bolt_scene import HOLE_M, BoltStart
+from handtouch.percept.action_request import CandidateAction, Question, expected_information_bits
+from handtouch.simulate.tactile.bolt_scene import BOLTS, HOLE_M, BoltStart
 from handtouch.simulate.tactile.bolt_workcell import BoltWorkcell, Pose
 
 FloatArray = NDArray[np.float64]
@@ -53,8 +45,8 @@ RADIUS_M = {"thumb": 11.5e-3, "index": 10e-3, "middle": 10e-3}
 ALONG_M = {"thumb": 9e-3, "index": 0.0, "middle": 20.5e-3}
 ABOVE_M = {"thumb": 5e-3, "index": 4e-3, "middle": 4e-3}
 """Where the fingertips' centres are in the grip, along the bolt and against the approach"""
-BOLT_ALONG_M = 1.5e-3
-"""Where the bolt's middle is: the thumb beside the head, the tip beyond the index finger"""
+HEAD_ALONG_M = 18.3e-3
+"""Where the bolt's head begins: the thumb beside it, the tip beyond the index finger"""
 POSTURE_RAD = {
     "thumb": [-0.479, 1.15, 0.02, 0.02],
     "index": [0.34, 0.828, 0.568, 0.528],
@@ -86,7 +78,7 @@ _BEGIN_M, _END_M = 0.028, 0.005
 _ALONG_M, _TURNS_RAD = (-0.012, 0.0, 0.012), np.radians([0, 50, 90, 130, 180, -130, -90, -50])
 """Touches to choose from, by places along a possible bolt and directions of the fingers to it"""
 _TOUCH_STD_M = 2e-3
-"""Of a touched point as it is predicted"""
+"""Of the height of a touch as it is predicted: by fingers, pads and what their model leaves out"""
 MIN_WEIGHT, MAX_STD_RAD, MAX_PRESSES = 0.95, np.radians(3.0), 10
 
 FORCE_N, MIN_FORCE_N = {"thumb": 4.0, "index": 2.4, "middle": 1.6}, 0.4
@@ -95,8 +87,9 @@ _PUSHED_M, _JAMMED_M = 0.5e-3, 1.5e-3
 _FREE_M = -0.03
 """Place of the tip before the hole from which on nothing can push the fingertips but the bolt in the grip"""
 _SPIRAL_PITCH_M, _SPIRAL_M = 0.5e-3, 4e-3
-INSERT_M = 9e-3
-"""Depth to reach, by the estimate of the bolt along the hand, which may be wrong by some millimetres"""
+INSERT_M, ENOUGH_M = 13e-3, 9e-3
+"""Depth to reach unless the fingers meet the plate, and from which on they may: by the estimate of the bolt
+along the hand, which may be wrong by some millimetres"""
 
 
 class Step(Enum):
@@ -187,6 +180,7 @@ class BoltStarter:
     ) -> None:
         self._robot, self._truth, self._log = robot, truth, log
         self._arm = Arm(robot.urdf, robot.joints)
+        self.bolt = KnownBolt(robot.scene.bolt)
         self._attempts = 0
         self._table: Pose = np.zeros(3), np.eye(3)  # the bolt on the table
         self._held: Pose = np.zeros(3), np.eye(3)  # the bolt in the grip
@@ -226,8 +220,9 @@ class BoltStarter:
             free.append(spheres)
             yaw = np.radians(120.0 * (number + 1))
             if len(found) > 2:
-                poses = poses_on_table(found, np.concatenate(free))
-                self._table, sure, std_rad = poses[0].pose, poses[0].weight, poses[0].direction_std_rad
+                poses = self.bolt.poses_on_table(found, np.concatenate(free))
+                self._table = self.bolt.lying(poses[0].parameters)
+                sure, std_rad = poses[0].weight, poses[0].direction_std_rad
                 if sure > MIN_WEIGHT and std_rad < MAX_STD_RAD:
                     break
                 place, yaw = self._most_telling(poses)
@@ -239,7 +234,7 @@ class BoltStarter:
         x, y, _ = 1e3 * self._table[0]
         toward, std_deg = np.degrees([np.arctan2(*self._table[1][1::-1, 2]), std_rad])
         told = f"bolt at {x:.1f}, {y:.1f} mm, toward {toward:.0f} degrees with std {std_deg:.1f}"
-        self._log(f"{told}; weight of this end {sure:.2f}")
+        self._log(f"{told}; weight of this pose {sure:.2f}")
         return Step.GRASP
 
     def _grasp(self) -> Step:
@@ -247,8 +242,8 @@ class BoltStarter:
         along = -np.array([*rotation[:2, 2], 0.0])
         along /= np.linalg.norm(along)
         axes = np.column_stack([np.cross(along, -UP), along, -UP])
-        place = position - BOLT_ALONG_M * along
-        place[2] = 7.5e-3
+        place = position + (self.bolt.half_m - self.bolt.head_m - HEAD_ALONG_M) * along
+        place[2] = 2.5e-3 + self.bolt.shank_m
         opened = self._fingers(0.02, 0.008)
         self._go(self._gripping((place + 0.1 * UP, axes)), opened, 1.5)
         self._go(self._gripping((place, axes)), opened, 1.5)
@@ -259,7 +254,8 @@ class BoltStarter:
         return Step.LIFT
 
     def _lift(self) -> Step:
-        self._go(self._above(self._flange), self._command, 1.0)
+        if not self._carry(self._above(self._flange), 1.0):
+            return self._put_down("it slips", self._grasped_at)
         forces = {finger: each.force_n for finger, each in self._fingertips().items()}
         self._log("lifted with " + ", ".join(f"{finger} {force:.1f} N" for finger, force in forces.items()))
         if not self._truth and not self._is_held():
@@ -273,7 +269,7 @@ class BoltStarter:
             self._held = relative(grip, self._truth())
             return Step.ORIENT
         contacts = [each.seen_from(grip) for each in self._fingertips().values()]
-        found = pose_in_grip(relative(self._grasped_at, self._table), contacts)
+        found = self.bolt.pose_in_grip(relative(self._grasped_at, self._table), contacts)
         self._held = found.pose
         tilt = np.degrees(np.arcsin(np.clip(self._held[1][[0, 2], 2], -1, 1)))
         told = f"in the grip at {1e3 * self._held[0].round(4)} mm, tilted by {tilt.round(1)} degrees"
@@ -282,14 +278,15 @@ class BoltStarter:
 
     def _orient(self) -> Step:
         axes = np.column_stack([np.cross([0.0, -1.0, 0.0], -UP), [0.0, -1.0, 0.0], -UP])
-        self._go(self._gripping((HOLE_M - [0.0, 0.1, 0.0], axes)), self._command, 2.0)
-        self._go(self._aimed(-0.012), self._command, 1.0)
-        if self._truth or self._is_held():
-            self._feel()
-            self._go(self._aimed(-0.008), self._command, 0.5)
-            return Step.INSERT
-        self._log("it was lost on the way: search again")
-        return Step.SEARCH
+        before_hole = self._gripping((HOLE_M - [0.0, 0.1, 0.0], axes))
+        if not (self._carry(before_hole, 2.0) and self._carry(self._aimed(-0.012), 1.0)):
+            return self._put_down("it slips")
+        if not self._truth and not self._is_held():
+            self._log("it was lost on the way: search again")
+            return Step.SEARCH
+        self._feel()
+        self._go(self._aimed(-0.008), self._command, 0.5)
+        return Step.INSERT
 
     def _insert(self) -> Step:
         rest = self._tips()
@@ -298,6 +295,8 @@ class BoltStarter:
         radius = 0.0
         while forward_m < INSERT_M:
             pushed_m = float(np.mean(rest - self._tips(), axis=0)[1])
+            if forward_m > ENOUGH_M and pushed_m > _PUSHED_M:
+                break
             if pushed_m > _JAMMED_M:
                 forward_m -= speed
                 if forward_m < _FREE_M:
@@ -316,15 +315,17 @@ class BoltStarter:
         self._log(f"inserted, {1e3 * radius:.1f} mm aside of the estimate")
         return Step.DONE
 
-    def _put_down(self, reason: str) -> Step:
-        """Put the bolt back on the table, to begin again."""
+    def _put_down(self, reason: str, grip: Pose | None = None) -> Step:
+        """Put the bolt back on the table, where the grip was or in the middle, to begin again."""
         self._log(f"{reason}: put it down")
-        position, rotation = self._flange
-        self._go((position - [0.0, 0.04, 0.0], rotation), self._command, 0.8)
-        _, axes = self._grip_pose()
-        upright = Rotation.align_vectors([-UP], [axes[:, 2]])[0].as_matrix() @ axes
-        self._go(self._gripping((np.array([0.0, 0.0, 0.1]), upright)), self._command, 1.5)
-        self._go(self._gripping((np.array([0.0, 0.0, 0.009]), upright)), self._command, 1.0)
+        if grip is None:
+            position, rotation = self._flange
+            self._go((position - [0.0, 0.04, 0.0], rotation), self._command, 0.8)
+            _, axes = self._grip_pose()
+            upright = Rotation.align_vectors([-UP], [axes[:, 2]])[0].as_matrix() @ axes
+            grip = np.array([0.0, 0.0, 0.009]), upright
+            self._go(self._gripping((np.array([0.0, 0.0, 0.1]), upright)), self._command, 1.5)
+        self._go(self._gripping(grip), self._command, 1.0)
         self._go(self._flange, self._fingers(0.02, 0.008), 0.5)
         return Step.SEARCH
 
@@ -334,15 +335,25 @@ class BoltStarter:
         self._sensed = self._robot.move(flange, joint_rad)
         self._flange, self._command = flange, joint_rad
 
+    def _carry(self, flange: Pose, duration_s: float) -> bool:
+        """Move with the bolt in the grip; stop and return False where it slips."""
+        return not self._go(flange, self._command, duration_s, until=self._slips)
+
     def _go(
-        self, flange: Pose, joint_rad: FloatArray, duration_s: float, until: Callable[[], bool] | None = None
+        self,
+        flange: Pose,
+        joint_rad: FloatArray,
+        duration_s: float,
+        until: Callable[[], bool] | None = None,
+        *,
+        evenly: bool = False,
     ) -> bool:
-        """Move smoothly; return whether `until` stopped it."""
+        """Move, smoothly or with an even speed; return whether `until` stopped it."""
         (begin_m, begin), before = self._flange, self._command
         turn = Slerp([0.0, 1.0], Rotation.from_matrix([begin, flange[1]]))
         steps = round(duration_s / self._robot.period_s)
         for s in np.arange(1, steps + 1) / steps:
-            part = s if until else s * s * (3 - 2 * s)
+            part = s if evenly else s * s * (3 - 2 * s)
             pose = begin_m + part * (flange[0] - begin_m), turn(part).as_matrix()
             self._move(pose, before + part * (joint_rad - before))
             if until and until():
@@ -364,7 +375,7 @@ class BoltStarter:
         q = self._arm.posture(POSTURE_RAD)
         for finger, along_m in ALONG_M.items():
             side, apart_m = (-1, thumb_m) if finger == "thumb" else (1, fingers_m)
-            away = side * (SHANK_M + RADIUS_M[finger] + apart_m)
+            away = side * (self.bolt.shank_m + RADIUS_M[finger] + apart_m)
             target = self._arm.grip[0] + self._arm.grip[1] @ [away, along_m, -ABOVE_M[finger]]
             q = self._arm.reach(finger, target, q)
         return q
@@ -390,7 +401,8 @@ class BoltStarter:
         self._go(self._flat_on(middle, 0.05, yaw), flat, 0.8)
         self._go(self._flat_on(middle, _BEGIN_M, yaw), flat, 0.2)
         last: dict[str, list[Contact]] = {}
-        if self._go(self._flat_on(middle, _END_M, yaw), flat, 1.5, until=lambda: bool(self._on_bolt())):
+        lowest = self._flat_on(middle, _END_M, yaw)
+        if self._go(lowest, flat, 1.5, until=lambda: bool(self._on_bolt()), evenly=True):
             for _ in range(5):
                 self._move(self._flange, flat)
                 for link, each in self._on_bolt().items():
@@ -405,28 +417,29 @@ class BoltStarter:
     def _most_telling(self, poses: list[OnTable]) -> tuple[FloatArray, float]:
         """Return place and yaw of the touch that is expected to tell possible poses of the bolt apart best.
 
-        For each pose that may be the true one: the weights of all after a touch where that pose predicts it;
-        what counts is how well the bolt's direction is known by them: the length of its mean vector.
+        The question is one as the daemon's estimators pose: which pose of the spread of all is true? Its
+        actions are touches about each pose, measured by the height at which the fingers meet the bolt.
         """
         drawn = [each for pose in poses for each in pose.spread()]
-        weights = np.array([weight for _, weight in drawn])
-        headings = np.exp(1j * np.array([parameters[2] for parameters, _ in drawn]))
+        total = sum(weight for _, weight in drawn)
         self._arm.set(self._arm.posture(FLAT_RAD))
         flat = self._flat_spheres(self._flat_on(np.zeros(2), 0.0, 0.0))
-        best, chosen = -1.0, (np.zeros(2), 0.0)
-        for (along_m, turn), pose in itertools.product(itertools.product(_ALONG_M, _TURNS_RAD), poses):
+        touches: list[tuple[FloatArray, float, CandidateAction]] = []
+        for pose, along_m, turn in itertools.product(poses, _ALONG_M, _TURNS_RAD):
             x, y, toward = pose.parameters
             place = np.array([x + along_m * np.cos(toward), y + along_m * np.sin(toward)])
             spheres = flat.copy()
             spheres[:, :3] = flat[:, :3] @ Rotation.from_euler("z", toward + turn).as_matrix().T
             spheres[:, :2] += place
-            touched = np.array([touched_m(lying(*each), spheres, _END_M) for each, _ in drawn])
-            apart = np.square(touched[:, None] - touched).sum(axis=2) / (2 * _TOUCH_STD_M**2)
-            after = weights[:, None] * np.exp(-apart / 2)
-            known = float(weights @ np.abs((after / after.sum(axis=0)).T @ headings))
-            if known > best:
-                best, chosen = known, (place, toward + turn)
-        return chosen
+            heights_m = [self.bolt.lowered_m(each, spheres, _END_M) for each, _ in drawn]
+            outcomes = {f"pose {k}": (height_m, _TOUCH_STD_M) for k, height_m in enumerate(heights_m)}
+            touches.append((place, toward + turn, CandidateAction("touch", {}, outcomes)))
+        weights = {f"pose {k}": weight / total for k, (_, weight) in enumerate(drawn)}
+        question = Question("bolt_on_table", 0, 0, 0, weights, [action for *_, action in touches])
+        bits = [expected_information_bits(question, action) for action in question.actions]
+        place, yaw, _ = touches[int(np.argmax(bits))]
+        self._log(f"asks which pose it is: a touch that is expected to tell {max(bits):.1f} bits")
+        return place, yaw
 
     def _spheres(self) -> FloatArray:
         """Return spheres in flat fingers (n, 4), centre in the world and radius."""
@@ -475,6 +488,11 @@ class BoltStarter:
         firm = [finger for finger, each in self._fingertips().items() if not each.force_n < MIN_FORCE_N]
         return "thumb" in firm and len(firm) > 1
 
+    def _slips(self) -> bool:
+        """Two of the holding fingers slide: one may roll, or change the place where it bears."""
+        rows = [self._robot.links.index(f"{finger}_distal") for finger in FORCE_N]
+        return int(np.count_nonzero(self._sensed.sliding[rows])) > 1
+
     def _tips(self) -> FloatArray:
         """Return the centres of the holding fingertips (3, 3) from the flange, along the world's axes."""
         self._arm.set(self._sensed.joint_rad)
@@ -482,12 +500,12 @@ class BoltStarter:
 
     def _aimed(self, beyond_m: float) -> Pose:
         """Return the flange's pose with the bolt on the hole's axis, its tip so far into the hole."""
-        position, rotation = self._held
+        _, rotation = self._held
         _, now = self._grip_pose()
         axis = now @ rotation[:, 2]
         turn, _ = Rotation.align_vectors([[0.0, 1.0, 0.0]], [axis])
         turned = turn.as_matrix() @ now
-        tip = position + HALF_M * rotation[:, 2]
+        _, tip = self.bolt.ends(self._held)
         return self._gripping((HOLE_M + np.array([0.0, beyond_m, 0.0]) - turned @ tip, turned))
 
 
@@ -504,17 +522,22 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="of the bolt's place, and of the world")
     parser.add_argument("--world", default="default")
     parser.add_argument("--clearance-mm", type=float, default=1.0)
+    parser.add_argument("--bolt", choices=BOLTS, default="M10x40")
     parser.add_argument("--truth", action="store_true", help="give the program the true pose")
     parser.add_argument("--daemon", type=int, default=0, help="touch by a daemon, N times slower")
     given = parser.parse_args()
     clearance_m, start = 1e-3 * given.clearance_mm, BoltStart.drawn(given.seed)
-    cell = BoltWorkcell(given.seed, start, given.world, clearance_m, slower=given.daemon)
-    truth = (lambda: cell.scene.bolt_pose) if given.truth else None
-    program = BoltStarter(cell, truth, lambda text: print(f"{cell.scene.data.time:6.2f} s  {text}"))
-    program.run()
-    print(" ".join(step.value for step in program.steps))
-    print(f"in truth: inserted by {1e3 * cell.scene.inserted_m:.1f} mm after {cell.scene.data.time:.0f} s")
-    cell.close()
+    bolt = BOLTS[given.bolt]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a daemon ends with this program
+    cell = BoltWorkcell(given.seed, start, given.world, clearance_m, bolt=bolt, slower=given.daemon)
+    with contextlib.closing(cell):
+        truth = (lambda: cell.scene.bolt_pose) if given.truth else None
+        program = BoltStarter(cell, truth, lambda text: print(f"{cell.scene.data.time:6.2f} s  {text}"))
+        program.run()
+        print(" ".join(step.value for step in program.steps))
+        print(
+            f"in truth: inserted by {1e3 * cell.scene.inserted_m:.1f} mm after {cell.scene.data.time:.0f} s"
+        )
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from handtouch.simulate.worlds import world_named
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CLEARANCE_M = 1e-3
+PAD_FRICTION = 0.9
 
 
 @pytest.fixture
@@ -68,10 +69,35 @@ def test_a_bolt_in_reach_is_started_by_touch_alone(program: Any) -> None:
     names = [step.value for step in starter.steps]
     assert names == ["search", "grasp", "lift", "feel", "orient", "insert", "done"]
     assert cell.scene.inserted_m >= 5e-3
-    assert [text.split()[0] for text in told if not text.startswith("touched")] == [
+    assert [text.split()[0] for text in told if not text.startswith(("touched", "asks"))] == [
         "bolt",
         "lifted",
         "in",
         "in",
         "inserted,",
     ]
+
+
+class _SeenError(Exception):
+    """What a test waits for has been seen."""
+
+
+@pytest.mark.timeout(900)  # it takes some 8 s of a processor
+def test_a_bolt_that_slips_in_the_grip_is_put_back_where_it_was(program: Any) -> None:
+    start = BoltStart(0.005, -0.005, 0.3)
+    cell, told = BoltWorkcell(5, start, "ideal", CLEARANCE_M), []
+    friction = cell.scene.model.geom_friction[:, 0]
+
+    def hear(text: str) -> None:
+        told.append(text.split(":")[0])
+        if text.startswith("bolt at"):  # it will be grasped: from now on the skin is slippery
+            friction[friction == PAD_FRICTION] = 0.4
+        if text.startswith("touched") and "it slips" in told:
+            raise _SeenError
+
+    starter = program.BoltStarter(cell, log=hear)
+    with pytest.raises(_SeenError):
+        starter.run()
+    names = [step.value for step in starter.steps]
+    assert names == ["search", "grasp", "lift", "search"]
+    assert cell.scene.bolt_pose[0][:2] == pytest.approx([start.x_m, start.y_m], abs=8e-3)

@@ -4,7 +4,7 @@ The arm holds the hand's root link at a commanded pose; every joint of the hand 
 motor. The world's frame has z up, and the table at z = 0. The bolt's frame has its origin in the middle of
 its length, with z from the head to the tip. The hole's axis is horizontal, along y.
 
-Public names: `BoltScene`, `Bolt`, `BoltStart`, `HOLE_M`.
+Public names: `BoltScene`, `Bolt`, `BOLTS`, `BoltStart`, `HOLE_M`.
 """
 
 from __future__ import annotations
@@ -59,6 +59,14 @@ class Bolt:
     def total_m(self) -> float:
         """Length of shank and head."""
         return self.length_m + self.head_m
+
+
+BOLTS = {
+    "M8x40": Bolt(8e-3, 40e-3, 13e-3, 5.3e-3),
+    "M10x40": Bolt(),
+    "M12x50": Bolt(12e-3, 50e-3, 18e-3, 7.5e-3),
+}
+"""Sizes with the heads of ISO 4017"""
 
 
 @dataclass(frozen=True)

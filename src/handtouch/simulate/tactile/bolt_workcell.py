@@ -19,18 +19,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import tomlkit
+from numpy.typing import NDArray
 
 from handtouch import config
 from handtouch.arrays import FloatArray
 from handtouch.client.hand import Hand
 from handtouch.client.hand_arrays import HandArrays
+from handtouch.client.subscriber import Subscriber, connect
 from handtouch.config import shipped
-from handtouch.simulate.tactile.bolt_scene import BoltScene, BoltStart
+from handtouch.simulate.tactile.bolt_scene import Bolt, BoltScene, BoltStart
 from handtouch.simulate.tactile.nodes import TactileNodes
 from handtouch.simulate.tactile.reading import TactileReading
 from handtouch.simulate.tactile.sensor import TactileSensor
 from handtouch.simulate.worlds import world_named
-from handtouch.wire import COLUMNS, HandFrame, PadState
+from handtouch.wire import COLUMNS, HandFrame, PadState, Percept
 
 _WINDOW = 0.9  # of the period, for the nodes' answers
 _GROUP = "239.74.163.47"
@@ -66,11 +68,22 @@ class ServedTouch:
             )
             self._seq = -1
             self._await(lambda arrays: bool((arrays.state.array == PadState.CLEAR).all()))
+            self._motions: Subscriber[Percept] = stack.enter_context(
+                connect("percept/*/motion", endpoint=daemon.live, key="")
+            )
+            self._labels = dict.fromkeys(self.links, "")
             self._stack = stack.pop_all()
 
     def close(self) -> None:
         """Stop daemon and nodes."""
         self._stack.close()
+
+    @property
+    def sliding(self) -> NDArray[np.bool_]:
+        """Pads (1, p) that the daemon's percepts report as sliding by now."""
+        while (motion := self._motions.recv(0.0)) is not None:
+            self._labels[f"{motion.hand}/{motion.link}"] = motion.label
+        return np.array([[label == "sliding" for label in self._labels.values()]])
 
     def read(self, data: Any) -> TactileReading:
         """Return the frame of the first SYNC from now on, at the contacts of an MjData."""
@@ -141,6 +154,8 @@ class Sensed(NamedTuple):
     joint_rad: FloatArray
     """(m,), reported positions of the hand's joints, in the order of `BoltWorkcell.joints`"""
     touch: TactileReading
+    sliding: NDArray[np.bool_]
+    """(p,), pads whose contact slid by the reading before"""
 
 
 class BoltWorkcell:
@@ -159,6 +174,7 @@ class BoltWorkcell:
         world: str = "default",
         clearance_m: float = 1e-3,
         *,
+        bolt: Bolt | None = None,
         slower: int = 0,
     ) -> None:
         drawn = world_named(world).draw(seed)
@@ -167,10 +183,10 @@ class BoltWorkcell:
         deployment = deployment.model_copy(update={"daemon": daemon})
         hand = deployment.hands[0]
         self.urdf = str(hand.urdf)
-        self.scene = BoltScene(hand, drawn, start, clearance_m)
+        self.scene = BoltScene(hand, drawn, start, clearance_m, bolt)
         self.joints = self.scene.joints
         of = (deployment, self.scene.model, world, seed)
-        self.touch = ServedTouch(*of, slower) if slower else TactileSensor(*of)
+        self.touch = ServedTouch(*of, slower) if slower else TactileSensor(*of, detects_slip=True)
         self.links = tuple(link.partition("/")[2] for link in self.touch.links)
         self.period_s = self.touch.period_s
         errors = drawn.joints(hand.name, len(self.joints))
@@ -211,4 +227,5 @@ class BoltWorkcell:
         reported_rad = scene.joint_rad + self._zero_rad + noise_rad
         if self._delay_steps:
             scene.step(self._delay_steps)
-        return Sensed(reported_rad, self.touch.read(scene.data))
+        (sliding,) = self.touch.sliding  # as percepts follow the frames
+        return Sensed(reported_rad, self.touch.read(scene.data), sliding)

@@ -16,12 +16,14 @@ from handtouch.config.channels import node_channels, order_by_electrode
 from handtouch.core.pad_model import PadModel
 from handtouch.core.pipeline import Pipeline
 from handtouch.core.slab import CountSlab
+from handtouch.core.stages.slip import MOTION_CLASSES
 from handtouch.simulate.tactile.mujoco_contacts import NO_POINTS, ContactReader, LinkPoints
 from handtouch.simulate.tactile.reading import TactileReading
 from handtouch.simulate.tactile.simulated_pads import SimulatedPads
 from handtouch.simulate.worlds import World, world_named
 from handtouch.wire import PadState
 
+_SLIDING = MOTION_CLASSES.index("sliding")
 _HANDS_PER_PIPELINE = 64
 """Environments that share a tick: enough to spread the cost of a call, and few enough for the caches"""
 _START_NS = 1_000_000_000
@@ -38,6 +40,7 @@ class TactileSensor:
     link, where they differ; a geom named `pad LINK` replaces the body's geoms as what the pad senses.
 
     For `settling_s` before the first reading nothing touches, so that the zeros of the channels are known.
+    `detects_slip`: slip is detected too, see `sliding`.
 
     `links` are the names of the pads, "hand/link", in the order of the arrays. Raises ValueError for an
     unknown world or seed, or a link without a body.
@@ -54,6 +57,7 @@ class TactileSensor:
         period_s: float | None = None,
         bodies: Mapping[str, str] | None = None,
         settling_s: float = 0.5,
+        detects_slip: bool = False,
     ) -> None:
         if environments < 1:
             raise ValueError(f"environments = {environments}: must be 1 or more")
@@ -74,6 +78,8 @@ class TactileSensor:
             for one, members in zip(drawn, self._members, strict=True)
         ]
         self._cores = _pipelines(deployment, environments, self._period_ns)
+        for core in self._cores:
+            core.tick.slip.set_requested(np.full(core.model.size, detects_slip))
         self._states = [core.save_state() for core in self._cores]
         self._columns = {
             name: (column.shape[1:], column.dtype)
@@ -91,6 +97,7 @@ class TactileSensor:
             self.period_s,
             bodies,
             settling_s,
+            detects_slip,
         )
         self._settle()
 
@@ -98,6 +105,13 @@ class TactileSensor:
     def steps(self) -> int:
         """Number of MuJoCo's steps per reading."""
         return max(round(self.period_s / self._reader.time_step_s), 1)
+
+    @property
+    def sliding(self) -> NDArray[np.bool_]:
+        """Pads (environments, p) whose contact slid in the last reading; none unless slip is detected."""
+        slips = [core.tick.slip for core in self._cores]
+        slid = [(one.contact_id > 0) & (one.contacts().label == _SLIDING) for one in slips]
+        return np.concatenate(slid).reshape(self.environments, -1)
 
     def read(self, data: Any) -> TactileReading:
         """Return the reading at the contacts of an environment's MjData, or of a sequence of them.
@@ -201,7 +215,7 @@ class TactileSensor:
 
 
 def _sensor_in_state(arguments: tuple[Any, ...], state: tuple[Any, ...]) -> TactileSensor:
-    deployment, model, world, seeds, environments, period_s, bodies, settling_s = arguments
+    deployment, model, world, seeds, environments, period_s, bodies, settling_s, detects_slip = arguments
     made = TactileSensor(
         deployment,
         model,
@@ -211,6 +225,7 @@ def _sensor_in_state(arguments: tuple[Any, ...], state: tuple[Any, ...]) -> Tact
         period_s=period_s,
         bodies=bodies,
         settling_s=settling_s,
+        detects_slip=detects_slip,
     )
     made.load_state(state)
     return made
