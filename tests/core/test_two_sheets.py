@@ -145,6 +145,32 @@ def test_force_and_radius_are_those_of_the_theory_whatever_the_radius(
     assert abs(found.radius_m - radius_m) < 4 * found.radius_std_m + 0.02 * radius_m
 
 
+BEHAVIOUR = """behaviour = { preset = "S1", adaptation_share = 0.0, creep_share = %.1f, creep_time_s = 0.25, \
+slow_creep = 0.0, parameter_std_fraction = 0.0, press_std = 0.2, back_force_std_n = 0.0 }
+"""
+
+
+def press_creeping(creep_share: float, force_n: float, radius_m: float) -> Values:
+    """Return what is published 0.5 s into a press on sheets that creep."""
+    rig = Rig(*[BEHAVIOUR % creep_share] * 2)
+    rig.press(0.0)
+    for tick in range(1, 101):
+        left = creep_share * np.exp(-tick * PERIOD_NS * 1e-9 / 0.25)
+        found = rig.press(force_n * (1 - left), radius_m, ticks=1)
+    return found
+
+
+@pytest.mark.parametrize("radius_m", [1.8e-3, 4.5e-3])
+def test_creep_does_not_tell_how_large_a_contact_is(radius_m: float) -> None:
+    """History and current grow alike with a radius that is supposed: what two presses differ in by chance
+    stays as uncertain as without creep, however long the press lasts."""
+    still, creeping = (press_creeping(share, 1.0, radius_m) for share in (0.0, 0.6))
+    assert still.radius_status == creeping.radius_status == "valid"
+    assert creeping.radius_std_m == pytest.approx(still.radius_std_m, rel=0.05)
+    assert creeping.radius_m == pytest.approx(still.radius_m, rel=0.03)
+    assert creeping.force_n == pytest.approx(still.force_n, rel=0.03)
+
+
 def test_force_of_one_sheet_is_wrong_where_its_radius_is() -> None:
     """What two sheets are for: the second's channel out of range leaves the first sheet's force, and
     interval."""

@@ -128,12 +128,12 @@ cdef packed struct SheetRow:
     double by_sheet
     double excess
     double by_excess
+    double by_history
 
 cdef packed struct RadiusRow:
     double log_radius
     double covariance
     double squared_excess
-    double log_force[2]
     double log_load[2]
     double load_variance[2]
     double by_radius[2]

@@ -28,7 +28,6 @@ cdef class TwoSheets:
     cdef double radius_m, radius_std_m, spreading, gradient2, pure, mixed, shared, uneven, squared, score, curvature
     cdef double log_load, load_variance, log_weight, growth, middle, width2, cell
     cdef double off, by_radius, variance, aside, by_aside
-    cdef loads.SheetInterval first_step, second_step
     cdef double centre, log_load_unit, level, least, weights, inverse, mean, square, radius, radius2
     cdef double log_first, log_second
 
@@ -45,13 +44,17 @@ cdef void estimate_both(
 cdef void _set_sheet(
     TwoSheets both, Py_ssize_t number, force.PadLaw law, force.PadLaw near, double total_a, double total_std_a,
     double series_ohm, double position_variance) noexcept
+@cython.locals(first=double, by_force=double)
+cdef void _set_histories(TwoSheets both) noexcept
+@cython.locals(step=loads.SheetInterval, load=double)
+cdef double _by_history(loads.SheetLoads history, Py_ssize_t index, double log_force) noexcept
 @cython.locals(least=double, factor=double,
                is_limited=bint, log_x2=double, std=double, by_stack=double, log_force=double, uneven=double,
-               layer=double, sheet=double, variance=double, load=double, gain=double,
+               layer=double, sheet=double, variance=double, gain=double,
                relative=double, by_radius=double, result=force.ForceResult)
 cdef void _evaluate_sheet(
     TwoSheets both, Py_ssize_t number, Py_ssize_t index, force.PadLaw near, loads.SheetLoads history,
-    loads.SheetInterval step, double log_radius) noexcept
+    double log_radius) noexcept
 @cython.locals(covariance=double, excess2=double, i=Py_ssize_t)
 cdef void _evaluate_both(TwoSheets both, double log_radius, Py_ssize_t number) noexcept
 @cython.locals(one=double, two=double, covariance=double, variance=double, weight=double, first=double,

@@ -1,7 +1,8 @@
 """Force and radius of a contact on two sheets of different alpha, by both total currents.
 
 A contact of one force and radius passes a current through each sheet. At a given radius either current gives
-a force, by the contact law and the sheet's history (`loads`); the radius is likely where both agree. All
+a force, by the contact law and the sheet's history (`loads`); the radius is likely where both agree. The
+histories are by the stated radius: another one changes them, and what they make of a current, alike. All
 forces are equally likely before, by their logarithm; the radius is log-normal, as the first sheet's table
 states it. The integral over ln radius takes both logarithms of force as normal at each radius, with the
 covariance of what they share: the distance from the edge, and a pressure that isn't even. Force and radius
@@ -42,6 +43,7 @@ SHEET_ROW = np.dtype(
         ("by_sheet", "<f8"),  # and where the sheet does
         ("excess", "<f8"),  # deviations by which the current exceeds what the radius passes, 0 or less
         ("by_excess", "<f8"),  # its derivative by ln radius
+        ("by_history", "<f8"),  # ln of load over apparent force, at any radius
     ]
 )
 """One of the two sheets under a contact"""
@@ -50,8 +52,7 @@ RADIUS_ROW = np.dtype(
         ("log_radius", "<f8"),
         ("covariance", "<f8"),  # of both logarithms of load
         ("squared_excess", "<f8"),
-        ("log_force", "<f8", 2),  # of each sheet, as the following
-        ("log_load", "<f8", 2),
+        ("log_load", "<f8", 2),  # of each sheet, as the following
         ("load_variance", "<f8", 2),
         ("by_radius", "<f8", 2),
     ]
@@ -137,8 +138,6 @@ class TwoSheets:
         self.stack, self.result = force.stack_table(), force.ForceResult()
         self.near, self.second_near = force.empty_law(), force.empty_law()
         self.pad = self.number = 0
-        self.first_step: loads.SheetInterval | None = None
-        self.second_step: loads.SheetInterval | None = None
         self.is_used = self.contradicts = False
         self.radius_m = self.radius_std_m = _NAN
         self.spreading = self.gradient2 = self.pure = self.mixed = self.shared = self.uneven = 0.0
@@ -190,7 +189,7 @@ def estimate_both(
     variance of the former by the position, and its covariance with the first sheet's stack factor by the
     total. total_a, total_std_a, series_ohm: of the first sheet's current. start_m: radius to begin the search
     at, NaN for the middle of those expected. The result has the first sheet's apparent force at the radius
-    found."""
+    that its table states."""
     k = both.numbers[pad]
     both.pad, both.number, both.result = pad, k, result
     both.is_used = both.contradicts = False
@@ -208,11 +207,11 @@ def estimate_both(
     both.shared = both.pure + both.mixed
     _set_sheet(both, 0, law, both.near, total_a, total_std_a, series_ohm, both.pure + 2.0 * both.mixed)
     _set_sheet(both, 1, both.laws[k], both.second_near, second_a, noise_a, 0.0, both.pure)
-    both.first_step, both.second_step = loads.find_step(both.first, pad), loads.find_step(both.second, k)
     both.uneven = law.parameters[0].uneven
     both.growth = _THIRD if law.parameters[0].growth > 0.0 else 0.0
     both.middle = law.parameters[0].log_radius
     both.width2 = max(law.parameters[0].radius_variance, _MIN_RADIUS_VARIANCE)
+    _set_histories(both)
     log_radius = math.log(start_m) if start_m > 0.0 else both.middle
     both.cell = 0.0
     log_radius = _find_radius(both, log_radius)
@@ -264,14 +263,34 @@ def _set_sheet(
     near.parameters[0].growth = near.parameters[0].radius_variance = near.parameters[0].uneven = 0.0
 
 
+def _set_histories(both: TwoSheets) -> None:
+    """Set what the sheets' histories make of their apparent forces, which they have by the radius that the
+    first sheet's table states, as on pads with one sheet.
+
+    Creep is linear: if the contact has another radius, apparent force, history and load differ by the same
+    factor."""
+    both.sheets[0].by_history = both.sheets[1].by_history = 0.0
+    _evaluate_both(both, both.middle, 1)
+    if both.growth > 0.0:
+        first = both.sheets[0].log_force
+        by_force = both.growth / (1.0 - both.growth * both.sheets[0].by_radius)
+        _evaluate_both(both, both.middle + by_force * first, 1)
+    both.log_first, both.log_second = both.sheets[0].log_force, both.sheets[1].log_force
+    both.sheets[0].by_history = _by_history(both.first, both.pad, both.log_first)
+    both.sheets[1].by_history = _by_history(both.second, both.number, both.log_second)
+
+
+def _by_history(history: loads.SheetLoads, index: int, log_force: float) -> float:
+    """Return ln of the load over the apparent force, whose logarithm is given; index: of the sheet."""
+    step = loads.find_step(history, index)
+    if step is None:
+        return 0.0
+    load = loads.find_load(history, step, index, math.exp(log_force))
+    return math.log(load) - log_force if load > 0.0 else 0.0
+
+
 def _evaluate_sheet(
-    both: TwoSheets,
-    number: int,
-    index: int,
-    near: force.PadLaw,
-    history: loads.SheetLoads,
-    step: loads.SheetInterval | None,
-    log_radius: float,
+    both: TwoSheets, number: int, index: int, near: force.PadLaw, history: loads.SheetLoads, log_radius: float
 ) -> None:
     """Compute the force by one sheet's current at a radius; index: of the sheet in its history."""
     result = both.result
@@ -301,11 +320,8 @@ def _evaluate_sheet(
     log_force = log_force * near.parameters[0].power - _MEAN_UNEVEN * layer
     log_force = max(-_MAX_LOG_FORCE, min(_MAX_LOG_FORCE, log_force))
     variance = std * std + layer * layer + sheet * sheet
-    both.sheets[number].log_force = both.sheets[number].log_load = log_force
-    if step is not None:
-        load = loads.find_load(history, step, index, math.exp(log_force))
-        if load > 0.0:
-            both.sheets[number].log_load = math.log(load)
+    both.sheets[number].log_force = log_force
+    both.sheets[number].log_load = log_force + both.sheets[number].by_history
     # either includes the error of the contact law
     gain, relative = history.log_gain_std[index], history.relative_std[index]
     variance = max(variance, gain * gain)
@@ -320,8 +336,8 @@ def _evaluate_sheet(
 
 def _evaluate_both(both: TwoSheets, log_radius: float, number: int) -> None:
     """Compute the loads by both sheets at a radius, and write them to a row of the table."""
-    _evaluate_sheet(both, 0, both.pad, both.near, both.first, both.first_step, log_radius)
-    _evaluate_sheet(both, 1, both.number, both.second_near, both.second, both.second_step, log_radius)
+    _evaluate_sheet(both, 0, both.pad, both.near, both.first, log_radius)
+    _evaluate_sheet(both, 1, both.number, both.second_near, both.second, log_radius)
     covariance = both.sheets[0].by_stack * both.sheets[1].by_stack * both.shared
     covariance += both.sheets[0].half_width * both.sheets[1].half_width
     covariance += both.sheets[0].by_layer * both.sheets[1].by_layer
@@ -331,7 +347,6 @@ def _evaluate_both(both: TwoSheets, log_radius: float, number: int) -> None:
     both.rows[number].log_radius, both.rows[number].covariance = log_radius, covariance
     both.rows[number].squared_excess = excess2
     for i in range(2):
-        both.rows[number].log_force[i] = both.sheets[i].log_force
         both.rows[number].log_load[i] = both.sheets[i].log_load
         both.rows[number].load_variance[i] = both.sheets[i].load_variance
         both.rows[number].by_radius[i] = both.sheets[i].by_radius
@@ -365,8 +380,6 @@ def _weigh_between(both: TwoSheets, log_radius: float, low: int) -> None:
     before, after = both.rows[low].squared_excess, both.rows[high].squared_excess
     both.rows[_BETWEEN].squared_excess = before + t * (after - before)
     for i in range(2):
-        before, after = both.rows[low].log_force[i], both.rows[high].log_force[i]
-        both.rows[_BETWEEN].log_force[i] = before + t * (after - before)
         before, after = both.rows[low].load_variance[i], both.rows[high].load_variance[i]
         both.rows[_BETWEEN].load_variance[i] = before + t * (after - before)
         slope, next_slope = both.rows[low].by_radius[i], both.rows[high].by_radius[i]
@@ -440,7 +453,6 @@ def _clear_sums(both: TwoSheets, middle: float) -> None:
     both.centre, both.log_load_unit = middle, both.log_load
     both.level, both.least = both.log_weight, _INFINITY
     both.weights = both.inverse = both.mean = both.square = both.radius = both.radius2 = 0.0
-    both.log_first = both.log_second = 0.0
 
 
 def _add_node(both: TwoSheets, log_radius: float, weight: float) -> None:
@@ -455,8 +467,6 @@ def _add_node(both: TwoSheets, log_radius: float, weight: float) -> None:
     both.square += weight * spread * spread * spread * spread * ratio * ratio
     both.radius += weight * size
     both.radius2 += weight * size * size
-    both.log_first += weight * both.rows[_BETWEEN].log_force[0]
-    both.log_second += weight * both.rows[_BETWEEN].log_force[1]
 
 
 def _finish(both: TwoSheets) -> None:
@@ -468,8 +478,8 @@ def _finish(both: TwoSheets) -> None:
     load, unit = weights / both.inverse, math.exp(both.log_load_unit)
     variance = (both.square - 2.0 * load * both.mean) / weights + load * load
     both.force_n[k], both.std_n[k] = unit * load, unit * math.sqrt(max(variance, 0.0))
-    both.second_force_n[k] = math.exp(both.log_second / weights)
-    result.force_n, result.std_n = math.exp(both.log_first / weights), 0.0
+    both.second_force_n[k] = math.exp(both.log_second)
+    result.force_n, result.std_n = math.exp(both.log_first), 0.0
     result.status = _FITTED if both.mean * both.inverse < _MAX_SPREAD * weights * weights else _WIDE
     radius = both.radius / weights
     relative2 = max(both.radius2 / weights - radius * radius, 0.0) / (radius * radius)
