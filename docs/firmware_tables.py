@@ -156,7 +156,7 @@ def _format_length(length_m: float) -> str:
 
 
 def with_tables(page: str) -> str:
-    """Return a page with all marked tables; that of the faults, which tests write, is left."""
+    """Return a page with all marked tables."""
     return _TABLE.sub(
         lambda mark: mark[1] + mark[2] + "".join(f"{row}\n" for row in _TABLES[mark[1]]()), page
     )
@@ -173,8 +173,8 @@ def _objects() -> Iterator[str]:
 
 
 def _checks() -> Iterator[str]:
-    yield from _head("check", "tests", "remedy")
-    yield from (f"| `{check.name}` | {check.tests} | {check.remedy} |" for check in CATALOGUE.values())
+    yield from _head("check", "tests")
+    yield from (f"| `{check.name}` | {check.tests} |" for check in CATALOGUE.values())
 
 
 def _currents() -> Iterator[str]:
