@@ -73,7 +73,8 @@ def publish(endpoints: Sequence[str], touched: int, rate_hz: float, pipe: Connec
     for publisher, endpoint, hand in zip(publishers, endpoints, hands, strict=True):
         publisher.bind(endpoint)
         frame = make_frame(links=LINKS, hand=hand, t_ns=_SENTINEL)
-        encoded = [wire.encode(message) for message in (*(contact(hand, k) for k in LINKS[:touched]), frame)]
+        contacts = [wire.encode(contact(hand, link)) for link in LINKS[:touched]]
+        encoded = [*contacts, wire.encode(frame)]
         messages.append([(topic, payload.partition(stamp)) for topic, payload in encoded])
     pipe.send("bound")
     while not pipe.poll():  # until the bridges have subscribed

@@ -152,7 +152,8 @@ slow_creep = 0.0, parameter_std_fraction = 0.0, press_std = 0.2, back_force_std_
 
 def press_creeping(creep_share: float, force_n: float, radius_m: float) -> Values:
     """Return what is published 0.5 s into a press on sheets that creep."""
-    rig = Rig(*[BEHAVIOUR % creep_share] * 2)
+    behaviour = BEHAVIOUR % creep_share
+    rig = Rig(behaviour, behaviour)
     rig.press(0.0)
     for tick in range(1, 101):
         left = creep_share * np.exp(-tick * PERIOD_NS * 1e-9 / 0.25)
