@@ -15,6 +15,7 @@ from handtouch.core.pipeline import Pipeline
 from handtouch.daemon.table_cache import build_pad_model
 from handtouch.simulate import TactileReading, TactileSensor
 from handtouch.simulate.sheet_history import SimulatedSheetHistory
+from handtouch.simulate.tactile import sensor as tactile_sensor
 from handtouch.simulate.tactile.mujoco_contacts import ContactReader
 from handtouch.simulate.tactile.simulated_pads import LiveSheets
 from handtouch.simulate.worlds import SHEET_KINDS, PartSpread, Uniform, World
@@ -96,8 +97,11 @@ class Sink:
         self.frames.append(decoded)
 
 
-def test_readings_are_the_hand_frames_of_the_daemons_pipeline_for_the_same_counts(model: Any) -> None:
-    run = Run(model, "default", seed=3, settling_s=0.0)
+def test_readings_are_the_hand_frames_of_the_daemons_pipeline_for_the_same_counts(
+    model: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tactile_sensor, "SETTLING_S", 0.0)  # so that the readings have all samples
+    run = Run(model, "default", seed=3)
     run.data.qpos[0] = 0.3  # falls for a quarter of a second
     readings = run.readings(50)
     sink = Sink()

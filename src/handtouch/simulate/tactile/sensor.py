@@ -1,6 +1,6 @@
 """Touch of a hand in a MuJoCo simulation: the arrays that the daemon would publish, without a bus or daemon.
 
-Public name: `TactileSensor`.
+Public names: `TactileSensor`, `SETTLING_S`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from handtouch.simulate.tactile.simulated_pads import SimulatedPads
 from handtouch.simulate.worlds import World, world_named
 from handtouch.wire import PadState
 
+SETTLING_S = 0.5
+"""A hundred samples of the shipped rate: zeros are known to a tenth of a sample's noise"""
 _SLIDING = MOTION_CLASSES.index("sliding")
 _HANDS_PER_PIPELINE = 64
 """Environments that share a tick: enough to spread the cost of a call, and few enough for the caches"""
@@ -39,7 +41,7 @@ class TactileSensor:
     `period_s`, the deployment's SYNC period unless stated otherwise. `bodies`: names of the model's bodies by
     link, where they differ; a geom named `pad LINK` replaces the body's geoms as what the pad senses.
 
-    For `settling_s` before the first reading nothing touches, so that the zeros of the channels are known.
+    For `SETTLING_S` before the first reading nothing touches, so that the zeros of the channels are known.
     `detects_slip`: slip is detected too, see `sliding`.
 
     `links` are the names of the pads, "hand/link", in the order of the arrays. Raises ValueError for an
@@ -56,7 +58,6 @@ class TactileSensor:
         environments: int = 1,
         period_s: float | None = None,
         bodies: Mapping[str, str] | None = None,
-        settling_s: float = 0.5,
         detects_slip: bool = False,
     ) -> None:
         if environments < 1:
@@ -85,7 +86,7 @@ class TactileSensor:
             name: (column.shape[1:], column.dtype)
             for name, column in self._cores[0].messages.frame_columns().items()
         }
-        self._settling_samples = round(settling_s / self.period_s)
+        self._settling_samples = round(SETTLING_S / self.period_s)
         self._samples = 0
         self._restarted: set[int] = set()
         self._arguments = (
@@ -96,7 +97,6 @@ class TactileSensor:
             environments,
             self.period_s,
             bodies,
-            settling_s,
             detects_slip,
         )
         self._settle()
@@ -215,7 +215,7 @@ class TactileSensor:
 
 
 def _sensor_in_state(arguments: tuple[Any, ...], state: tuple[Any, ...]) -> TactileSensor:
-    deployment, model, world, seeds, environments, period_s, bodies, settling_s, detects_slip = arguments
+    deployment, model, world, seeds, environments, period_s, bodies, detects_slip = arguments
     made = TactileSensor(
         deployment,
         model,
@@ -224,7 +224,6 @@ def _sensor_in_state(arguments: tuple[Any, ...], state: tuple[Any, ...]) -> Tact
         environments=environments,
         period_s=period_s,
         bodies=bodies,
-        settling_s=settling_s,
         detects_slip=detects_slip,
     )
     made.load_state(state)
