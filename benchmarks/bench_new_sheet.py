@@ -20,6 +20,7 @@ from benchmarks.page import Report, options, progress
 from benchmarks.scores import Share
 from handtouch import config
 from handtouch.calibration.auto_calibration import AutoCalibrator
+from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact, StationaryContactDetector
 from handtouch.core.pad_model import PadModel, ampere_per_count_of, noise_counts_of
@@ -66,7 +67,9 @@ def calibrator(
     model = pad_channels(pad, sheet, node)
     if str(pad.surface) not in parts:
         models = models_with_other_parts(model, pad, node, sheet)
-        parts[str(pad.surface)] = PartModels(models, part_limits(pad, node))
+        parts[str(pad.surface)] = PartModels(
+            models, part_limits(pad, node), elongation_error(pad, sheet, model)
+        )
     stds = part_stds(pad, node, sheet)
     made = AutoCalibrator(model, parts[str(pad.surface)], stds, channel_gain_std(pad, node))
     made.assign_node(_SERIAL, None, None, "", 0)

@@ -43,6 +43,7 @@ from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, options
 from benchmarks.scores import Estimates, EstimateScore, concatenate, slices
 from handtouch.calibration.auto_calibration import AutoCalibrator
+from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
@@ -137,7 +138,11 @@ def learn(
     rest = np.lib.stride_tricks.sliding_window_view(padded, REST_PAUSES, axis=0).mean(axis=-1)
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     network = pad_network(pad, sheet)
-    parts = PartModels(models_with_other_parts(network, pad, node, sheet), part_limits(pad, node))
+    parts = PartModels(
+        models_with_other_parts(network, pad, node, sheet),
+        part_limits(pad, node),
+        elongation_error(pad, sheet, network),
+    )
     calibrator = AutoCalibrator(network, parts, part_stds(pad, node, sheet), node.gain_std)
     calibrator.assign_node(row + 1, None, None, "", 0)
     noise_a, count = contact_noise_a(model, row), model.electrode_counts[row]
@@ -149,7 +154,8 @@ def learn(
         sync_ns = round((REST_S + number * STEP_S + SAMPLE_S) * 1e9)
         currents_a = (reading - zeros) * model.ampere_per_count[row, :count]
         given.append(number)
-        if calibrator.add_contact(StationaryContact(currents_a, noise_a, HELD_SAMPLES, sync_ns)).apply:
+        contact = StationaryContact(currents_a, noise_a, HELD_SAMPLES, sync_ns, number)
+        if calibrator.add_contact(contact).apply:
             gains = calibrator.gains
             covariance = tuple(np.ravel(gains.covariance).tolist())
             applied = ActiveCalibration(

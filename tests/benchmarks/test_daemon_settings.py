@@ -106,7 +106,7 @@ def test_automatic_calibration_begins_with_the_same_estimator() -> None:
     ]
     noise = np.full(4, 1e-4)
     for number, row in enumerate(currents.T):
-        calibrator.add_contact(StationaryContact(row, noise, 8, number))
+        calibrator.add_contact(StationaryContact(row, noise, 8, number, number))
     for first in range(0, 64, BATCH_CONTACTS // 2):
         part = currents[:, first : first + BATCH_CONTACTS // 2]
         estimator.add_contacts(part, np.repeat(noise[:, None], part.shape[1], axis=1), first)

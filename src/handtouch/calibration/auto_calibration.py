@@ -170,22 +170,25 @@ class AutoCalibrator:
         before = self.estimate.contacts
         currents = np.transpose([one.currents for one in contacts])
         noise = np.transpose([one.noise for one in contacts])
+        batch = currents, noise, contact.last_sync_ns, [one.touch for one in contacts]
         if (
             self._sheet_test is None
             and self.calibration_state is CalibrationState.CALIBRATED
             and self.part_stds
         ):
             self._sheet_test = SheetTest(self.gains, self._new_estimator)
-        self._estimator.add_contacts(currents, noise, contact.last_sync_ns)
+        self._estimator.add_contacts(*batch)
         self.estimate = self._estimator.estimate
-        if self._test_sheet(currents, noise, contact.last_sync_ns):
+        if self._test_sheet(*batch):
             return GainUpdate(apply=True)
         if self.estimate.contacts == before:
             return GainUpdate()
         self._check_gain_limits()
         return self._assess_estimate(contact.last_sync_ns)
 
-    def _test_sheet(self, currents: FloatArray, noise: FloatArray, now_ns: int) -> bool:
+    def _test_sheet(
+        self, currents: FloatArray, noise: FloatArray, now_ns: int, touches: Sequence[int]
+    ) -> bool:
         """Test whether contacts (c, n) are on the calibrated sheet; return whether that has changed.
 
         While they aren't, the estimate is that of another sheet on the same node.
@@ -193,7 +196,7 @@ class AutoCalibrator:
         if self._sheet_test is None:
             return False
         test, before = self._sheet_test, self._sheet_test.is_replaced
-        estimator = test.add_contacts(currents, noise, now_ns)
+        estimator = test.add_contacts(currents, noise, now_ns, touches)
         if test.is_replaced and not before:
             self._estimator = estimator
         elif before and not test.is_replaced:
@@ -367,12 +370,14 @@ class SheetTest:
         """finished: a window of contacts is on the calibrated sheet"""
         self._start_window()
 
-    def add_contacts(self, currents: FloatArray, noise: FloatArray, now_ns: int) -> GainEstimator:
+    def add_contacts(
+        self, currents: FloatArray, noise: FloatArray, now_ns: int, touches: Sequence[int]
+    ) -> GainEstimator:
         """Add contacts as `GainEstimator` does; return the estimator of a new sheet, by the window's."""
         self._begin_ns = now_ns if self._begin_ns is None else self._begin_ns
         estimator, before = self._window, self._window.estimate.contacts
         self._since_ns = self._since_ns or now_ns
-        estimator.add_contacts(currents, noise, now_ns)
+        estimator.add_contacts(currents, noise, now_ns, touches)
         contacts = estimator.estimate.contacts
         if contacts == before:
             return estimator

@@ -1,7 +1,8 @@
 """Scores of contacts: what the currents of a point contact leave over, and what gains add to them.
 
-Public: `ContactScores` of a batch of contacts; `score_slopes`; `gain_deviation` and `fisher_covariance`, the
-Fisher bounds for a shape of pad and for given contacts; `gain_basis`, `channel_count`, `UNKNOWNS`.
+Public: `ContactScores` of a batch of contacts; `score_slopes`; `elongation_error`; `gain_deviation` and
+`fisher_covariance`, the Fisher bounds for a shape of pad and for given contacts; `gain_basis`,
+`channel_count`, `UNKNOWNS`.
 """
 
 from __future__ import annotations
@@ -13,12 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from handtouch import config
 from handtouch.arrays import FloatArray
 from handtouch.field.estimate import estimate
-from handtouch.field.model import ForwardModel, FractionModel, channel_noise
+from handtouch.field.model import ChannelModel, ForwardModel, FractionModel, channel_noise
+from handtouch.hand.pads import elongation_stds, pad_surface
 
 UNKNOWNS = 3
 """Unknowns of a contact: position and total."""
+_GRID_MARGIN = 0.1  # of a side
+_DIFFERENCE_STEP = 0.01
+"""Step of difference quotients, over a side: small beside the margin."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,23 @@ class ContactScores:
         sensitivity = total[:, None] * np.linalg.norm(null / sigma.T[:, :, None], axis=1)
         is_point = np.asarray(np.isfinite(positions).all(axis=0))[:, None]
         return cls(np.stack([x, y]), np.where(is_point, score, 0.0), slope * is_point, sensitivity)
+
+
+def elongation_error(pad: config.Pad, sheet: config.Sheet, model: ChannelModel) -> float:
+    """Return the standard deviation of the fractions, as scores see it, of contacts as elongated as stated.
+
+    Root mean square over the pad, `_GRID_MARGIN` of a side and farther from the edges. 0 for three channels.
+    """
+    at = np.linspace(_GRID_MARGIN, 1 - _GRID_MARGIN, 9)
+    x, y = (grid.ravel() for grid in np.meshgrid(at * model.a, at * model.b))
+    step = _DIFFERENCE_STEP * model.a
+    # second derivatives (c, 2, n) by x x and x y; that by y y is minus the first, as fractions are harmonic
+    after, before = (model.fractions_with_jacobian(along, y)[1] for along in (x + step, x - step))
+    second = (after - before) / (2 * step)
+    null, _ = score_slopes(model, x, y, np.ones((len(second), x.size)), np.ones(x.size))
+    squares = (np.einsum("ncs,cjn->njs", null, second) ** 2).sum(axis=1)
+    variances = elongation_stds(sheet, pad_surface(pad), model, x) ** 2
+    return math.sqrt((squares * variances[:, None]).mean()) if squares.size else 0.0
 
 
 def gain_deviation(model: ForwardModel, contacts: int = 400) -> float:

@@ -79,14 +79,14 @@ class GainEstimate:
 
     gains: (c,), factors that correct the currents; their product is 1, a common factor is not observable.
     covariance: (c, c), of the logarithms of the gains; singular, as they sum to zero. Widened by the misfit.
-    touch_error: standard deviation of the fractions of a touch, another one each time, that explains the
-        scores beyond noise; patches that aren't round have one.
+    touch_error: standard deviation of the fractions of a touch, another one each time: that stated, or what
+        explains the scores beyond noise; patches that aren't round have one.
     part_offsets: (p,) of the other parts, in their standard deviations as stated.
     joint_covariance: (c + p, c + p) of the logarithms of the gains and of these.
     widening: standard deviation of the parts that may be wider than stated, as these contacts show it, over
         that stated; at least 1.
-    contacts: number used. effective_contacts: number that counts, once those at one position and those that
-        are no points are discounted. point_fraction: share of them that are points.
+    contacts: number used. effective_contacts: number that counts, once those of one touch, at one position,
+        and those that are no points are discounted. point_fraction: share of them that are points.
     misfit: root mean square score of recent points, near 1 where model and noise are right.
     reason: of the status, as text.
     """
@@ -119,6 +119,10 @@ class PartModels(NamedTuple):
     limits: ArrayLike = 1.0
     """(p,) how many times that deviation a part may have at most, if contacts show that such parts have more
     than stated; stored parts were found so before"""
+    touch_error: float = 0.0
+    """standard deviation of the fractions of a touch, as stated (`elongation_error`) or more. The contacts of
+    a touch share it, so a touch never adds more information than it allows, however many contacts a slide
+    has. A few touches don't show how large it is, as parts explain their scores, too."""
 
 
 NO_PARTS = PartModels()
@@ -194,17 +198,22 @@ class GainEstimator:
         self._cell_information = np.full((_CELLS_PER_SIDE, _CELLS_PER_SIDE, scores), already)
         self._mixture = _OutlierMixture()
         self._pending: list[FloatArray] = []
-        self._touch_variance = 0.0
+        self._stated_touch_variance = self._touch_variance = parts.touch_error**2
+        self._last_touch: tuple[float, FloatArray] = math.nan, np.zeros(scores)
+        """number of the last contact's touch, and the information that its scores (s,) have without errors"""
         self._contacts, self._effective_contacts = 0, 0.0
         self._misfit_sums = np.array([1.0, 0.0])  # weighted sum of squares, and of weights
         self._last_ns: int | None = None
 
-    def add_contacts(self, currents: ArrayLike, noise: ArrayLike, now_ns: int) -> int:
+    def add_contacts(
+        self, currents: ArrayLike, noise: ArrayLike, now_ns: int, touches: ArrayLike = math.nan
+    ) -> int:
         """Add contacts, one column each; return the number of useful ones.
 
         currents: (c, n) or (c,), any unit, offsets taken off, *not* corrected by this estimator's gains.
         noise: their standard deviations, same unit: one, (c,) a channel, or broadcastable. Give a held
             contact once, as its mean with the noise of that mean. now_ns: monotonic time of the last of them.
+        touches: (n,) numbers of the touches they are parts of, such as slides; NaN: a touch of its own.
         Raises ValueError for three channels, other shapes, or a time before that of the contacts given
         before.
         """
@@ -218,11 +227,13 @@ class GainEstimator:
             raise ValueError(f"now_ns = {now_ns}: contacts of {self._last_ns} were added before")
         self._propagate_drift(now_ns)
         columns = np.concatenate([readings.reshape(c, -1), sigma.reshape(c, -1)])
-        useful = columns[:, self._usable(columns[:c], columns[c:])]
+        numbers = np.broadcast_to(np.asarray(touches, dtype=np.float64), (1, columns.shape[1]))
+        is_useful = self._usable(columns[:c], columns[c:])
+        useful = np.concatenate([columns, numbers])[:, is_useful]
         self._pending.extend(useful.T)
         while len(self._pending) >= BATCH_CONTACTS:
             batch, self._pending = np.array(self._pending[:BATCH_CONTACTS]).T, self._pending[BATCH_CONTACTS:]
-            self._process_batch(batch[:c], batch[c:])
+            self._process_batch(batch[:c], batch[c:-1], batch[-1])
         return int(useful.shape[1])
 
     @property
@@ -374,8 +385,8 @@ class GainEstimator:
             self._information = _inverse(after)
             self._cell_information *= np.trace(before[:free, :free]) / np.trace(after[:free, :free])
 
-    def _process_batch(self, currents: FloatArray, sigma: FloatArray) -> None:
-        """Process a batch (c, n): iterate around the former gains, then keep its information."""
+    def _process_batch(self, currents: FloatArray, sigma: FloatArray, touches: FloatArray) -> None:
+        """Process a batch (c, n) of touches (n,): iterate around the former gains; keep its information."""
         known, known_parts, positions = self._log_gains, self._part_offsets, None
         known_variance, contacts = self._touch_variance, min(self._contacts, _MEMORY_CONTACTS)
         basis, free, count = self._gain_basis, self._channels - 1, currents.shape[1]
@@ -385,7 +396,7 @@ class GainEstimator:
                 self._model, self._parts, currents * gains, sigma * gains, positions
             )
             positions = view.positions
-            share, cells = self._information_shares(view)
+            share, cells, last_touch = self._information_shares(view, touches)
             error2 = self._model_error**2 + self._touch_variance
             spread = np.sqrt(1 + error2 * view.score_sensitivity**2)
             mixture = replace(self._mixture)
@@ -397,12 +408,14 @@ class GainEstimator:
             touch_variance = _touch_variance(
                 (found.squared_scores * spread**2).ravel(), view.score_sensitivity.ravel()
             )
-            self._touch_variance = (contacts * known_variance + count * touch_variance) / (contacts + count)
+            touch_variance = (contacts * known_variance + count * touch_variance) / (contacts + count)
+            self._touch_variance = max(touch_variance, self._stated_touch_variance)
             step = np.concatenate([found.step[:free], found.step[free:] - self._part_offsets])
             self._part_offsets = found.step[free:]
             if step @ information @ step < _CONVERGED_STEP_SIGMA**2:
                 break
         self._information, self._mixture, self._cell_information = information, mixture, cells
+        self._last_touch = last_touch
         self._contacts += count
         self._effective_contacts += float((found.precision * spread**2).mean(axis=1).sum())
         fade = 1 - count / _MEMORY_CONTACTS
@@ -411,12 +424,15 @@ class GainEstimator:
             found.point_probability.sum(),
         ]
 
-    def _information_shares(self, view: ContactScores) -> tuple[FloatArray, FloatArray]:
-        """Return the share of each score's information (n, s) given earlier ones nearby, and the updated
-        cells.
+    def _information_shares(
+        self, view: ContactScores, touches: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[float, FloatArray]]:
+        """Return the share of each score's information (n, s) given earlier ones of its touch and nearby; the
+        updated cells; and the last touch with its information.
 
-        Independent information i of a cell and a common error m give 1 / (1 / i + m^2) together. Errors of
-        each touch reduce its own.
+        Independent information i of a touch or a cell and a common error m give 1 / (1 / i + m^2) together.
+        By the inequality of Cauchy and Schwarz, that is no more than they have if the error of a touch isn't
+        the same in all its scores but m is its root mean square there.
         """
         cells, error = self._cell_information.copy(), self._model_error**2
         at = (
@@ -424,14 +440,17 @@ class GainEstimator:
             .clip(0, _CELLS_PER_SIDE - 1)
             .astype(int)
         )
-        own = view.score_sensitivity**2
-        kept = 1 / (1 + self._touch_variance * own)
+        own, touch_error = view.score_sensitivity**2, self._touch_variance
+        touch, in_touch = self._last_touch
         share = np.zeros(own.shape)
         for k, (i, j) in enumerate(at.T):
+            known = in_touch if touches[k] == touch else np.zeros(own.shape[1])
+            touch, in_touch = float(touches[k]), known + own[k]
+            kept = 1 / ((1 + known * touch_error) * (1 + in_touch * touch_error))
             before = cells[i, j].copy()
-            cells[i, j] += kept[k] * own[k]
-            share[k] = kept[k] / ((1 + before * error) * (1 + cells[i, j] * error))
-        return share, cells
+            cells[i, j] += kept * own[k]
+            share[k] = kept / ((1 + before * error) * (1 + cells[i, j] * error))
+        return share, cells, (touch, in_touch)
 
 
 def _touch_variance(squared_scores: FloatArray, sensitivity: FloatArray) -> float:

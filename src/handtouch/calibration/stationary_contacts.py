@@ -1,7 +1,7 @@
 """Segment contacts into stationary ones: from the samples of a pad to mean currents of contacts at rest.
 
 Public: `StationaryContactDetector` of one pad; `StationaryContact`. A held contact is one stationary contact
-however long it lasts, a slow slide many: each adds information on the gains, see `gains`.
+however long it lasts, a slow slide many, which share the touch's error: see `gains`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,14 @@ _MAX_SAMPLES = 256
 
 @dataclass(frozen=True)
 class StationaryContact:
-    """Contact at rest: mean currents (c,), their noise (c,) [A], number of samples, time of the last."""
+    """Contact at rest: mean currents (c,), their noise (c,) [A], number of samples, time of the last, and
+    number of the touch that it is a part of."""
 
     currents: FloatArray
     noise: FloatArray
     samples: int
     last_sync_ns: int
+    touch: int
 
 
 class StationaryContactDetector:
@@ -102,7 +104,8 @@ class StationaryContactDetector:
         ):
             return None
         self._last_fractions = fractions
-        return StationaryContact(total / count, self._noise / np.sqrt(count), count, sync_ns)
+        noise = self._noise / np.sqrt(count)
+        return StationaryContact(total / count, noise, count, sync_ns, self._contact_id)
 
     def _clear_sums(self) -> None:
         self._current_sum = np.zeros(len(self._noise))

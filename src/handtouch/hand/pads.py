@@ -2,8 +2,8 @@
 
 Public names: `pad_surface`, `mount_transform`, `network_parameters`, `pad_channels`, `pad_network`,
 `press_map`, `channel_gain_std`, `electrode_network`, `models_with_other_parts`, `part_stds`, `part_limits`,
-`series_ohm_stds`, `shape_stds`, `metres_per_unit`, `relative_size_stds`, `log_aspect_std`,
-`rotation_from_rpy`, `MountUncertainty`.
+`series_ohm_stds`, `shape_stds`, `elongation_stds`, `metres_per_unit`, `relative_size_stds`,
+`log_aspect_std`, `rotation_from_rpy`, `MountUncertainty`.
 """
 
 from __future__ import annotations
@@ -247,6 +247,22 @@ def shape_stds(
         return np.ones(2 * network.channels), 1.0
     assert isinstance(network, ElectrodeNetwork)
     return sheet.gap_std_mm * _M_PER_MM / metres_per_unit(pad, network), sheet.unevenness_std
+
+
+def elongation_stds(
+    sheet: config.Sheet, surface: Surface, network: ChannelModel, x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return half the standard deviation of the difference of variances of a contact's current, at x (k,).
+
+    Along the rectangle's axes, in squares of its unit, of elliptical patches of pressure in all directions.
+    """
+    if isinstance(network, ChannelMap):
+        return np.ascontiguousarray(network.patch_std(x, np.full(len(x), surface.b / 2)))
+    area_m2 = (sheet.contact_radius_mm**2 + sheet.contact_radius_std_mm**2) * _M_PER_MM**2
+    difference_m2 = area_m2 / 4 * 2 * math.sinh(sheet.contact_elongation_std)
+    inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
+    along_x, along_y = surface.scales(inside, np.full(len(x), surface.b / 2))
+    return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
 
 
 def metres_per_unit(pad: config.Pad, network: ElectrodeNetwork) -> NDArray[np.float64]:

@@ -20,9 +20,9 @@ from handtouch.config.channels import channel_states
 from handtouch.core.memory import view_memory
 from handtouch.core.pad_tables import CELLS_PER_TOLERANCE_CELL, ForwardTable
 from handtouch.core.stages import tables
-from handtouch.field.channel_map import ChannelMap
 from handtouch.field.network import ElectrodeNetwork
 from handtouch.hand.pads import (
+    elongation_stds,
     log_aspect_std,
     pad_surface,
     relative_size_stds,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from handtouch import config
     from handtouch.arrays import FloatArray
     from handtouch.field.model import ChannelModel
-    from handtouch.field.surface_base import Surface
 
 
 _WAVES = 5  # of the sheet resistance
@@ -94,7 +93,7 @@ class PadTolerances:
         )
         self.middle_u_m = surface.extent_m[0] / 2
         self.size_x, self.size_y = relative_size_stds(pad, sheet)
-        elongations = _elongations(sheet, surface, network, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
+        elongations = elongation_stds(sheet, surface, network, table.nodes_x[::CELLS_PER_TOLERANCE_CELL, 0])
         self.elongations, self.is_elongated = view_memory(elongations), bool(elongations.any())
         radius_m = math.hypot(sheet.contact_radius_mm, sheet.contact_radius_std_mm) * _M_PER_MM
         self.overhangs = view_memory(radius_m * overhangs(sheet.contact_elongation_std))
@@ -199,24 +198,10 @@ def shape_error(pad: config.Pad, sheet: config.Sheet, network: ChannelModel, tab
     x, y = (nodes[::CELLS_PER_TOLERANCE_CELL, 0] for nodes in (table.nodes_x, table.nodes_y))
     second = table.tolerance_nodes[:, :, 0, -2 * table.electrodes :].astype(np.float64)
     square = (
-        (second**2).sum(axis=2) / table.electrodes * _elongations(sheet, pad_surface(pad), network, x) ** 2
+        (second**2).sum(axis=2) / table.electrodes * elongation_stds(sheet, pad_surface(pad), network, x) ** 2
     )
     inside = [(at > _MARGIN * at.max()) & (at < (1 - _MARGIN) * at.max()) for at in (y, x)]
     return float(np.sqrt(np.median(square[np.ix_(*inside)])))
-
-
-def _elongations(sheet: config.Sheet, surface: Surface, network: ChannelModel, x: FloatArray) -> FloatArray:
-    """Return half the standard deviation of the difference of variances of a contact's current, at x (k,).
-
-    Along the rectangle's axes, in squares of its unit, of elliptical patches of pressure in all directions.
-    """
-    if isinstance(network, ChannelMap):
-        return np.ascontiguousarray(network.patch_std(x, np.full(len(x), surface.b / 2)))
-    area_m2 = (sheet.contact_radius_mm**2 + sheet.contact_radius_std_mm**2) * _M_PER_MM**2
-    difference_m2 = area_m2 / 4 * 2 * math.sinh(sheet.contact_elongation_std)
-    inside = np.clip(x, 1e-6 * surface.a, (1 - 1e-6) * surface.a)
-    along_x, along_y = surface.scales(inside, np.full(len(x), surface.b / 2))
-    return np.ascontiguousarray(difference_m2 / (2 * math.sqrt(2)) / (along_x * along_y))
 
 
 def part_count(electrodes: int) -> int:
