@@ -113,6 +113,13 @@ def test_version_round_trips_through_json(tmp_path: Path) -> None:
         assert CalibrationVersion.from_json(version.to_json()) == version
 
 
+def test_a_law_stored_without_its_age_holds_at_that_of_settled_weights() -> None:
+    stated = CalibrationVersion(7, CONFIG, 1, "", Provenance("x"), calibration(1))
+    record = stated.to_json()
+    assert record["calibration"]["law"].pop("age_s") == 1.5
+    assert CalibrationVersion.from_json(record) == stated
+
+
 def from_record(**changes: object) -> CalibrationVersion:
     record = CalibrationVersion(7, CONFIG, 1, "", Provenance("x"), calibration(1)).to_json()
     return CalibrationVersion.from_json(record | changes)

@@ -150,6 +150,11 @@ slow_creep = 0.0, parameter_std_fraction = 0.0, press_std = 0.2, back_force_std_
 """
 
 
+CREEPING = BEHAVIOUR.replace("slow_creep = 0.0", "slow_creep = 0.05").replace(
+    "press_std = 0.2", "press_std = 0.01"
+)
+
+
 def press_creeping(creep_share: float, force_n: float, radius_m: float) -> Values:
     """Return what is published 0.5 s into a press on sheets that creep."""
     behaviour = BEHAVIOUR % creep_share
@@ -208,6 +213,28 @@ def test_a_calibrated_law_of_the_second_sheet_is_applied_and_undone() -> None:
     assert rig.press(1.0).force_n == pytest.approx(1.1 * before.force_n, rel=0.03)
     rig.pipeline.set_calibration(0, default)
     assert rig.press(1.0) == pytest.approx(before, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("keys", "least_rise"), [(("law",), 1.01), (("second_law",), 1.5), (("law", "second_law"), 1.5)]
+)
+def test_force_is_uncertain_by_the_time_since_the_laws_of_both_sheets_were_measured(
+    keys: tuple[str, ...], least_rise: float
+) -> None:
+    """The second sheet's law, of alpha 1, counts more, as its force doesn't depend on the radius."""
+    rig = Rig(CREEPING % 0.0, CREEPING % 0.0)
+    rig.press(0.0)
+    file, stds = rig.pipeline.calibrations[0], []
+    laws = {"law": rig.model.default_law(0), "second_law": rig.model.default_second_law(0)}
+    for age_s in (1.5, 15.0):
+        own = {key: replace(law, age_s=age_s) for key, law in laws.items() if law is not None and key in keys}
+        measured = replace(
+            file, calibration_id="measured", law=own.get("law"), second_law=own.get("second_law")
+        )
+        rig.pipeline.set_calibration(0, measured)
+        rig.press(0.0, ticks=100)
+        stds.append(rig.press(1.0, ticks=200).force_std_n)
+    assert stds[1] > least_rise * stds[0]
 
 
 def test_a_stuck_second_channel_is_left_out_and_taken_again_once_it_moves() -> None:

@@ -335,6 +335,7 @@ def test_contact_law_applies_from_the_next_sample_and_other_parts_stay(served: B
     file = served.ask("calibrate", pad="plane")
     assert file["calibration_id"] == file["previous_calibration_id"] == file["default_calibration_id"]
     nominal = {"contact_ohm_mm2": 20000.0, "alpha": 1.5, "ohm_per_square": 2400.0, "hertz_force_n": None}
+    nominal["age_s"] = 1.5
     assert file["law"] == nominal
     law = {**nominal, "contact_ohm_mm2": 20000.0 * 8}
     now = served.ask("calibrate", pad="plane", name="c2", law=law)

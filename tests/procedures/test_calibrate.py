@@ -165,6 +165,17 @@ def test_hidden_law_is_found_without_scatter() -> None:
     assert fit.scatter < 0.01
 
 
+def test_a_law_is_as_old_as_the_weights_that_it_was_measured_by() -> None:
+    readings = Table(weights()).readings()
+    assert fitted(readings).law.age_s == 1.5
+    ages_s = [2.0 if k % 2 else 8.0 for k in range(len(readings) - 1)] + [4.0]
+    timed = [
+        replace(reading, unloaded_s=10.0 * k - 1.0, loaded_s=10.0 * k, measured_s=10.0 * k + age_s)
+        for k, (reading, age_s) in enumerate(zip(readings, ages_s, strict=True))
+    ]
+    assert fitted(timed).law.age_s == pytest.approx(4.0)
+
+
 @pytest.mark.parametrize("radius_std", [0.0, 0.1])
 def test_intervals_cover_the_true_law_in_95_percent_of_procedures(radius_std: float) -> None:
     """Their half widths are 1.96 standard deviations of the errors' logarithms, give or take 2.5 of 40."""

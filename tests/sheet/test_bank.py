@@ -72,6 +72,33 @@ def test_slow_creep_is_learned_and_compensated() -> None:
     assert force == pytest.approx(3.0, rel=0.06)
 
 
+@pytest.mark.parametrize("law_age_s", [1.5, 10.0])
+@pytest.mark.parametrize("age_s", [1.0, 1.5, 10.0, 40.0])
+def test_slow_creep_is_uncertain_by_the_time_since_the_law_was_measured(
+    law_age_s: float, age_s: float
+) -> None:
+    """(t / t0)^n: an exponent that is known within 0.05 leaves 0.05 |ln(t / t0)| of the load."""
+    bank = ModelBank(NOT_ADAPTING.adaptation, BankPrior(exponent_std=0.05), BankState.empty(1))
+    bank.set_law_ages(np.full(1, law_age_s))
+    bank.begin_contacts(np.array([0]), np.zeros(1), 0.3)
+    bank.advance(np.full(1, 3.0), np.full(1, age_s), np.zeros(1))
+    _, creep_std = bank.spread(slice(None))
+    assert creep_std[0] == pytest.approx(0.05 * abs(np.log(age_s / law_age_s)), abs=1e-12)
+
+
+@pytest.mark.parametrize("law_age_s", [1.5, 10.0])
+def test_a_law_measured_later_contains_what_a_sheet_crept_until_then(law_age_s: float) -> None:
+    """Readings in units of what the sheet reads at the law's age are the load's, at any age."""
+    creep = power_law(0.08)
+    hold = Hold(SheetModel(NOT_ADAPTING.adaptation, creep), NOT_ADAPTING)
+    hold.bank.set_law_ages(np.full(1, law_age_s))
+    for long_s in GRIPS[:4]:
+        hold.grip(long_s)
+    for long_s in (2, 10, 128):
+        force, _ = hold.grip(long_s)
+        assert force / creep.response(law_age_s) == pytest.approx(3.0, rel=0.06)
+
+
 def test_intervals_narrow_with_use() -> None:
     hold = Hold(NOT_ADAPTING, NOT_ADAPTING)
     _, first = hold.grip(4)

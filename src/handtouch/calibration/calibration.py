@@ -41,6 +41,9 @@ NEW_SHEET_METHOD = "sheet replaced"
 """Method of a version that sets aside what was known of a sheet, as its node has another one."""
 MIN_GAIN, MAX_GAIN = 0.1, 10.0
 """Range of gain factors; no amplifier meant for these channels is beyond it."""
+LAW_AGE_S = 1.5
+"""Age of contacts at which a law holds that doesn't state it: `handtouch calibrate` takes means of a second,
+from a second after a weight is down."""
 
 
 class MismatchError(ValueError):
@@ -139,7 +142,8 @@ class LawParameters:
     """Contact law (paper eq. 12) and sheet; keys as in a deployment's `[sheet.NAME]`.
 
     covariance: (3, 3), of ln contact_ohm_mm2, alpha, ln ohm_per_square. hertz_force_n: force at which a
-    contact has the sheet's contact_radius_mm, from which it grows as force^(1/3); None: it doesn't.
+    contact has the sheet's contact_radius_mm, from which it grows as force^(1/3); None: it doesn't. age_s: of
+    the contacts that it was measured by: where a sheet creeps, its readings are the law's at that age.
     """
 
     contact_ohm_mm2: Positive
@@ -147,6 +151,7 @@ class LawParameters:
     ohm_per_square: Positive
     covariance: Covariance3
     hertz_force_n: Positive | None = None
+    age_s: Positive = LAW_AGE_S
 
 
 @dataclass(frozen=True, config=_RECORD)
@@ -319,7 +324,7 @@ def differences(
 ) -> list[tuple[str, Sequence[float] | str | None, Any]]:
     """Return what differs as (name, before, after), without covariances."""
     rows: list[tuple[str, Any, Any]] = []
-    of_law = ("contact_ohm_mm2", "alpha", "ohm_per_square", "hertz_force_n")
+    of_law = ("contact_ohm_mm2", "alpha", "ohm_per_square", "hertz_force_n", "age_s")
     for part, names in (
         ("gains", ("factors",)),
         ("offsets", ("counts", "variance", "noise")),

@@ -90,6 +90,8 @@ class LawValues(TypedDict):
     """of the sheet"""
     hertz_force_n: NotRequired[float | None]
     """force at which a contact has `contact_radius_mm`, which grows as force^(1/3); None: it doesn't"""
+    age_s: NotRequired[float]
+    """age of the contacts that it was measured by; where a sheet creeps, the law holds at that age [s]"""
 
 
 class PadCalibration(TypedDict):

@@ -358,7 +358,8 @@ class Behaviour(Table):
     slow_creep: Annotated[float, Field(ge=0, le=1)] = Field(
         0.05,
         description="relative growth of a reading each time that a touch lasts e times longer (1 sigma): "
-        "creep by a power law, which is learned from use",
+        "creep by a power law, which is learned from use; the contact law holds for touches of 1.5 s, or as "
+        "old as those that it was calibrated by",
     )
     forget_time_s: Positive = Field(
         45.0,

@@ -347,6 +347,17 @@ class PadModel:
         """Return the contact law of the deployment."""
         return self._file_laws[pad]
 
+    @property
+    def law_ages_s(self) -> FloatArray:
+        """Ages (n,) [s] of contacts at which the laws hold."""
+        return np.array([self.law(pad).age_s for pad in range(self.size)])
+
+    @property
+    def second_law_ages_s(self) -> FloatArray:
+        """Ages (m,) [s] of contacts at which the laws of the second sheets hold."""
+        laws = zip(self.second_pads.tolist(), [law for _, law in self._second_parts], strict=True)
+        return np.array([(self.calibrations[pad].second_law or law).age_s for pad, law in laws])
+
     def copy_calibrations(self, other: PadModel) -> None:
         """Take over all calibrations of the model that this one replaces."""
         for pad, calibration in enumerate(self.continued_calibrations(other, other.calibrations)):

@@ -115,6 +115,7 @@ class SecondSheets:
         """Compute what follows from the state, after that was loaded, and the model."""
         if self.any_configured:
             self._baseline.set_settings(self._baseline_settings(model))
+            self._compensation.set_law_ages(model.second_law_ages_s)
             self._compensation.refresh()
 
     def _baseline_settings(self, model: PadModel) -> BaselineSettings:

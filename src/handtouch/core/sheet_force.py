@@ -213,6 +213,11 @@ class SheetForceCompensation:
         for group in self.groups:
             group.bank.update_weights()
 
+    def set_law_ages(self, age_s: FloatArray) -> None:
+        """Set the ages (n,) [s] of contacts at which the pads' contact laws hold."""
+        for group in self.groups:
+            group.bank.set_law_ages(age_s[group.pads])
+
     def _reset(self) -> None:
         """Begin with fresh sheets, without evidence."""
         unreliable, reliable = ForceReliability.UNRELIABLE, ForceReliability.RELIABLE

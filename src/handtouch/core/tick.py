@@ -77,6 +77,7 @@ class TickProcessor:
             self._set_stages(model)
         self.contacts.set_settings(DetectionSettings.of_model(model))
         self.baseline.set_settings(_baseline_settings(model))
+        self.sheet_force.set_law_ages(model.law_ages_s)
         self.sheet_force.refresh()
         self.second.refresh(model)
         self.slip.refresh()

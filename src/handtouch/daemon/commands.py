@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from handtouch import wire
-from handtouch.calibration.calibration import MAX_GAIN, MIN_GAIN, LawParameters
+from handtouch.calibration.calibration import LAW_AGE_S, MAX_GAIN, MIN_GAIN, LawParameters
 from handtouch.config import Deployment, ObjectTable, Table
 from handtouch.config.files import deployment_files
 from handtouch.config.tables import RequestedOutput, SceneRequest
@@ -85,6 +85,7 @@ class _LawArguments(Table):
     alpha: Annotated[float, Field(ge=0.1, le=10)]
     ohm_per_square: Resistance
     hertz_force_n: Annotated[float, Field(gt=0, le=1000)] | None = None
+    age_s: Annotated[float, Field(gt=0, le=3600)] = LAW_AGE_S
 
 
 class _CalibrateArguments(Table):

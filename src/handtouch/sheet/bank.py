@@ -38,8 +38,8 @@ BANK_MODELS, BANK_WINDOW, BANK_LEARNED = len(_SHARE), 7, 3 * len(_SHARE)
 
 _FIRST_S = 1.0
 """Begin of the first window."""
-_REFERENCE_S = np.where(np.isfinite(_CREEP_END_S), 10.0, _FIRST_S)
-"""Age at which a reading is the load's."""
+_CREEP_BEGIN_S = np.where(np.isfinite(_CREEP_END_S), _FIRST_S, 0.1)
+"""Age from which a sheet creeps slowly: where the stated creep ends, or as soon as the bank is updated."""
 _STEADY_PROBABILITY = 0.5
 _STEADY_STD, _UNSTEADY_STD = 0.01, 0.15
 """Changes of the log reading between windows of a steady hold, and of one that isn't."""
@@ -132,11 +132,18 @@ class ModelBank:
         )
         self._fatigue_s = float(np.asarray(adaptation.fatigue_s))
         self._prior, self._log_prior = prior, prior.log_weights()
+        self.set_law_ages(np.full(len(state.age_s), _FIRST_S))
         self._adapts = self._share > 0
         self._weights = self._applied = np.zeros_like(state.log_weight)
         self.rejected: BoolArray = np.zeros(len(state.age_s), np.bool_)
         """(n,), adaptation was rejected: holds are steadier without its compensation"""
         self.reset_pads(np.arange(len(state.age_s)))
+
+    def set_law_ages(self, age_s: FloatArray) -> None:
+        """Set the ages (n,) [s] of the readings that the pads' contact laws were measured by.
+
+        A lasting load reads as its law has it at that age, whatever the exponent of slow creep."""
+        self._log_law_age = _log_age(age_s)
 
     def update_weights(self) -> None:
         """Compute the models' probabilities after the state was changed."""
@@ -173,7 +180,7 @@ class ModelBank:
         """Return standard deviations over the models (k,): of the back force [N], and of the logarithm of
         slow creep's factor."""
         state, weights, applied = self._state, self._weights[rows], self._applied[rows]
-        ages = _log_age(state.age_s[rows])
+        ages = self._log_growing_time(rows, state.age_s[rows])
         within = (weights * state.exponent_variance[rows] * np.square(ages)).sum(1)
         growth = _variance(weights, applied, state.exponent[rows] * ages) + within
         return np.sqrt(_variance(weights, applied, state.back_n[rows])), np.sqrt(growth)
@@ -236,7 +243,7 @@ class ModelBank:
         age = before_s + flow
         state.age_s[rows] = age
         reading = effective_n[rows] * state.growth[rows]
-        creep = np.exp(-state.exponent[rows] * _log_age(age))
+        creep = np.exp(-state.exponent[rows] * self._log_growing_time(rows, age))
         effective = reading[:, None] * creep
         load = effective + state.back_n[rows]
         speed = 1 + (current_flow_s[rows] + flow / 2) / self._fatigue_s
@@ -258,8 +265,13 @@ class ModelBank:
 
     def _update_growth(self, rows: IntArray) -> None:
         state = self._state
-        creep = np.exp(-state.exponent[rows] * _log_age(state.age_s[rows]))
+        creep = np.exp(-state.exponent[rows] * self._log_growing_time(rows, state.age_s[rows]))
         state.growth[rows] = 1 / (self._applied[rows] * creep).sum(1)
+
+    def _log_growing_time(self, rows: IntArray | slice, age_s: FloatArray) -> FloatArray:
+        """Return logarithms (k, BANK_MODELS) of ages (k,) [s] over those of the laws, as far as sheets creep
+        at them."""
+        return np.asarray(_log_age(age_s) - self._log_law_age[rows])
 
     def _add_to_windows(
         self, rows: IntArray, flow: FloatArray, log_reading: FloatArray, log_load: FloatArray
@@ -313,7 +325,7 @@ class ModelBank:
         found = _KEPT * state.log_weight[rows] + np.log(likelihood)
         found -= found.max(axis=1, keepdims=True)
         state.log_weight[rows] = np.maximum(found, _MIN_LOG_WEIGHT)
-        return np.asarray(slope * _log_age(middle_s) * move)
+        return np.asarray(slope * self._log_growing_time(rows, middle_s) * move)
 
 
 def check_learned(learned: npt.ArrayLike) -> None:
@@ -328,7 +340,7 @@ def check_learned(learned: npt.ArrayLike) -> None:
 
 def _log_age(age_s: FloatArray) -> FloatArray:
     """Return logarithms (k, BANK_MODELS) of the ages (k,) [s] that count for slow creep."""
-    return np.asarray(np.log(np.clip(age_s[:, None], _FIRST_S, _CREEP_END_S) / _REFERENCE_S))
+    return np.asarray(np.log(np.clip(age_s[:, None], _CREEP_BEGIN_S, _CREEP_END_S)))
 
 
 def _density(change: FloatArray, variance: FloatArray) -> FloatArray:

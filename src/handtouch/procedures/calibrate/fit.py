@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
 from handtouch.arrays import FloatArray
-from handtouch.calibration.calibration import LawParameters, matrix
+from handtouch.calibration.calibration import LAW_AGE_S, LawParameters, matrix
 from handtouch.field import ContactLaw
 from handtouch.procedures.calibrate.readings import ContactCircuit, WeightReading
 
@@ -328,6 +328,12 @@ def _scatter(residual: FloatArray, known: FloatArray, by_load: FloatArray, freed
     return math.exp(low)
 
 
+def _mean_age_s(readings: Sequence[WeightReading]) -> float:
+    """Return the age at which creep by a power law is the mean of these readings'."""
+    ages = np.array([reading.measured_s - reading.loaded_s for reading in readings])
+    return float(np.exp(np.log(ages).mean())) if (ages > 0).all() else LAW_AGE_S
+
+
 def _build_fit(
     solved: _LawSolution, observed: bool, readings: Sequence[WeightReading], evidence: float
 ) -> LawFit:
@@ -338,6 +344,7 @@ def _build_fit(
         math.exp(theta[2]),
         matrix(_symmetric(solved.covariance[:3, :3])),
         data.hertz_force_n,
+        _mean_age_s(readings),
     )
     quantile = float(stdtrit(solved.degrees_of_freedom, 0.975))
     half = [quantile * solved.std(i) for i in range(3)]
