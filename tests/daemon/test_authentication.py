@@ -319,6 +319,7 @@ def test_repeated_refusals_are_logged_at_a_limited_rate(
         with pytest.raises(PermissionError):
             _receives(served.live, unknown)
     served.skipped_ns = 11 * _SECOND_NS
+    served.until(lambda: served.now_ns - start_ns > served.skipped_ns)  # what is polled now has that time
     with pytest.raises(PermissionError):
         _receives(served.live, unknown)
     lines = [r.getMessage() for r in caplog.records if REFUSAL_CAUSES["unknown_key"] in r.getMessage()]

@@ -115,6 +115,7 @@ def test_the_showcases_program_can_drive_it(bolt: BoltEnvironment, program: Any)
 
     class Recorder:
         urdf, joints, links, period_s = cell.urdf, cell.joints, cell.links, cell.period_s
+        scene = cell.scene  # whose bolt is known
         start_at = staticmethod(cell.start_at)
 
         def move(self, flange: Any, joint_rad: Any) -> Any:
