@@ -20,7 +20,7 @@ from handtouch import wire
 from handtouch.client.daemon_clock import MIN_AGE_LIMIT_S, DaemonClock, age_limit_s
 from handtouch.client.hand_arrays import HandArrays
 from handtouch.client.link_column import NotSampledError
-from tests.client.hand_messages import LINKS, make_frame, make_service
+from tests.client.hand_messages import LINKS, make_contact, make_frame, make_service
 
 LONGEST_S = 60.0
 SECOND_NS = 1_000_000_000
@@ -198,15 +198,16 @@ def test_loops_end_with_an_error_when_the_daemon_is_another(hand: handtouch.Hand
 
 
 def test_callbacks_are_told_that_the_daemon_is_gone(publisher: Any, endpoints: dict[str, str]) -> None:
-    lost, seen = [threading.Event(), threading.Event()], threading.Event()
+    lost, seen = [threading.Event(), threading.Event()], [threading.Event(), threading.Event()]
     with handtouch.Hand("right", endpoint=endpoints["live"], max_age_s=1e9) as hand:
-        hand.on_frame(lambda _: seen.set(), lost[0].set)
-        hand.on_contact(lambda _: None, lost[1].set)
+        hand.on_frame(lambda _: seen[0].set(), lost[0].set)
+        hand.on_contact(lambda _: seen[1].set(), lost[1].set)
         end_s = time.monotonic() + LONGEST_S
         for seq in range(1, 10_000):
             publish(publisher, seq, time.monotonic_ns())
+            publisher.send_multipart(wire.encode(make_contact("index_tip", "begin", seq, seq=seq)))
             publisher.send_multipart(wire.encode(make_service(seq=seq)))
-            if seen.wait(0.01) and seq > 30:
+            if all(event.wait(0.01) for event in seen) and seq > 30:
                 break
             assert time.monotonic() < end_s
         assert not lost[0].is_set()
