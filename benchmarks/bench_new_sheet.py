@@ -20,11 +20,10 @@ from benchmarks.page import Report, options, progress
 from benchmarks.scores import Share
 from handtouch import config
 from handtouch.calibration.auto_calibration import AutoCalibrator
-from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact, StationaryContactDetector
 from handtouch.core.pad_model import PadModel, ampere_per_count_of, noise_counts_of
-from handtouch.hand import channel_gain_std, models_with_other_parts, pad_channels, part_limits, part_stds
+from handtouch.hand import channel_gain_std, pad_channels, part_stds
 from handtouch.simulate.stimulus import NodeReplacement
 from handtouch.simulate.virtual_hand import VirtualHand
 from handtouch.simulate.worlds import WORLDS, Family, MountSpread
@@ -66,10 +65,7 @@ def calibrator(
     node, sheet = deployment.nodes[pad.node], deployment.sheet_of(pad)
     model = pad_channels(pad, sheet, node)
     if str(pad.surface) not in parts:
-        models = models_with_other_parts(model, pad, node, sheet)
-        parts[str(pad.surface)] = PartModels(
-            models, part_limits(pad, node), elongation_error(pad, sheet, model)
-        )
+        parts[str(pad.surface)] = PartModels.of_pad(model, pad, node, sheet)
     stds = part_stds(pad, node, sheet)
     made = AutoCalibrator(model, parts[str(pad.surface)], stds, channel_gain_std(pad, node))
     made.assign_node(_SERIAL, None, None, "", 0)

@@ -43,13 +43,12 @@ from benchmarks.oracle import PadOracle
 from benchmarks.page import Report, options
 from benchmarks.scores import Estimates, EstimateScore, concatenate, slices
 from handtouch.calibration.auto_calibration import AutoCalibrator
-from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact
 from handtouch.config import Deployment, load, shipped
 from handtouch.core.active_calibration import ActiveCalibration
 from handtouch.core.pad_model import PadModel
-from handtouch.hand import models_with_other_parts, pad_network, part_limits, part_stds
+from handtouch.hand import pad_network, part_stds
 from handtouch.simulate.scenario import Scenario
 from handtouch.simulate.truth import GroundTruth
 from handtouch.simulate.virtual_hand import VirtualHand
@@ -138,11 +137,7 @@ def learn(
     rest = np.lib.stride_tricks.sliding_window_view(padded, REST_PAUSES, axis=0).mean(axis=-1)
     node, sheet = deployment.nodes[pad.node], deployment.sheets[pad.sheet]
     network = pad_network(pad, sheet)
-    parts = PartModels(
-        models_with_other_parts(network, pad, node, sheet),
-        part_limits(pad, node),
-        elongation_error(pad, sheet, network),
-    )
+    parts = PartModels.of_pad(network, pad, node, sheet)
     calibrator = AutoCalibrator(network, parts, part_stds(pad, node, sheet), node.gain_std)
     calibrator.assign_node(row + 1, None, None, "", 0)
     noise_a, count = contact_noise_a(model, row), model.electrode_counts[row]

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from handtouch.calibration.auto_calibration import AutoCalibrator, GainUpdate
-from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContact, StationaryContactDetector
 from handtouch.config import Sheet, parse
 from handtouch.field import ElectrodeNetwork
-from handtouch.hand import channel_gain_std, models_with_other_parts, pad_channels, part_limits, part_stds
+from handtouch.hand import channel_gain_std, pad_channels, part_stds
 from handtouch.hand.pads import log_aspect_std
 from tests.deployments import deployment_text, pad_text
 
@@ -49,8 +48,7 @@ def contacts(network: ElectrodeNetwork, count: int, seed: int, from_s: float) ->
 def calibrator(stated: Sheet = SHEET) -> AutoCalibrator:
     """Return the calibration of a new node of the pad."""
     network = pad_channels(PAD, stated, NODE)
-    models = models_with_other_parts(network, PAD, NODE, stated)
-    parts = PartModels(models, part_limits(PAD, NODE), elongation_error(PAD, stated, network))
+    parts = PartModels.of_pad(network, PAD, NODE, stated)
     made = AutoCalibrator(network, parts, part_stds(PAD, NODE, stated), channel_gain_std(PAD, NODE))
     made.assign_node(1, None, None, "", 0)
     return made

@@ -29,17 +29,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from handtouch import config
 from handtouch.arrays import FloatArray
 from handtouch.calibration.calibration import Gains
 from handtouch.calibration.contact_scores import (
     UNKNOWNS,
     ContactScores,
     channel_count,
+    elongation_error,
     gain_basis,
     gain_deviation,
 )
 from handtouch.field.estimate import estimate
-from handtouch.field.model import ForwardModel, FractionModel, channel_noise
+from handtouch.field.model import ChannelModel, ForwardModel, FractionModel, channel_noise
+from handtouch.hand.pads import models_with_other_parts, part_limits
 
 # Constants without an origin beside them were chosen; docs/benchmarks/swap.md measures what they yield.
 BATCH_CONTACTS = 32
@@ -123,6 +126,17 @@ class PartModels(NamedTuple):
     """standard deviation of the fractions of a touch, as stated (`elongation_error`) or more. The contacts of
     a touch share it, so a touch never adds more information than it allows, however many contacts a slide
     has. A few touches don't show how large it is, as parts explain their scores, too."""
+
+    @classmethod
+    def of_pad(
+        cls, network: ChannelModel, pad: config.Pad, node: config.Node, sheet: config.Sheet
+    ) -> PartModels:
+        """Return those that a deployment states of a pad, whose channels are `network`'s."""
+        return cls(
+            models_with_other_parts(network, pad, node, sheet),
+            part_limits(pad, node),
+            elongation_error(pad, sheet, network),
+        )
 
 
 NO_PARTS = PartModels()

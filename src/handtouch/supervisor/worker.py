@@ -29,7 +29,6 @@ from handtouch.calibration.calibration import (
     channel_values,
     matrix,
 )
-from handtouch.calibration.contact_scores import elongation_error
 from handtouch.calibration.gains import PartModels
 from handtouch.calibration.stationary_contacts import StationaryContactDetector
 from handtouch.calibration.store_client import MountingPoint, StoreClient
@@ -40,10 +39,8 @@ from handtouch.core.pad_model import ampere_per_count_of, default_calibration_id
 from handtouch.field.model import ChannelModel
 from handtouch.hand import (
     channel_gain_std,
-    models_with_other_parts,
     network_parameters,
     pad_channels,
-    part_limits,
     part_stds,
 )
 from handtouch.supervisor.deployment_diagnostics import DeploymentDiagnostics
@@ -127,11 +124,7 @@ class SupervisorWorker:
             self._ampere_per_count[number, : len(scale)] = scale
             if design not in models:
                 network = pad_channels(pad, sheet, node)
-                parts = PartModels(
-                    models_with_other_parts(network, pad, node, sheet),
-                    part_limits(pad, node),
-                    elongation_error(pad, sheet, network),
-                )
+                parts = PartModels.of_pad(network, pad, node, sheet)
                 stds, gain_std = part_stds(pad, node, sheet), channel_gain_std(pad, node)
                 models[design] = network, parts, stds, gain_std
             mounting_point = MountingPoint(hand, pad.link, default_calibration_id_of(pad, deployment))
